@@ -1,0 +1,34 @@
+"""Data sets, episodes, windows and the expert database."""
+
+from torchrl_rad.data.database import ExpertDatabase
+from torchrl_rad.data.episodes import episode_lengths, return_to_go, step_and_remaining
+from torchrl_rad.data.experts import (
+    Expert,
+    episode_length,
+    expert_from_config,
+    first_hit_within,
+    reaches_goal,
+    subtasks_done,
+    top_share_by_return,
+)
+from torchrl_rad.data.pointmaze import collect_pointmaze, pointmaze_dataset
+from torchrl_rad.data.windows import Window, WindowSampler, window_buffer
+
+__all__ = [
+    "Expert",
+    "ExpertDatabase",
+    "Window",
+    "WindowSampler",
+    "collect_pointmaze",
+    "episode_length",
+    "episode_lengths",
+    "expert_from_config",
+    "first_hit_within",
+    "pointmaze_dataset",
+    "reaches_goal",
+    "return_to_go",
+    "step_and_remaining",
+    "subtasks_done",
+    "top_share_by_return",
+    "window_buffer",
+]

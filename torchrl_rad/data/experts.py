@@ -1,0 +1,170 @@
+"""Which recorded episodes are demonstrations."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+__all__ = [
+    "Expert",
+    "episode_length",
+    "expert_from_config",
+    "first_hit_within",
+    "reaches_goal",
+    "subtasks_done",
+    "top_share_by_return",
+]
+
+
+class Expert:
+    """A named rule that says which episodes are demonstrations; rules combine with ``&``, ``|`` and ``~``.
+
+    Calling it with one episode (a TensorDict [L]) gives a bool. ``select`` answers for a list of episodes and is what
+    :class:`~torchrl_rad.data.ExpertDatabase` asks, since some rules compare episodes with each other.
+
+    Args:
+        config (dict): name and arguments, from which :func:`expert_from_config` builds the rule again.
+        predicate (callable): one episode -> bool.
+
+    Examples:
+        >>> rule = episode_length(1000) & ~reaches_goal()
+        >>> rule
+        (episode_length(1000) & ~reaches_goal())
+    """
+
+    def __init__(self, config: dict[str, Any], predicate: Callable[[TensorDictBase], bool]):
+        self.config = config
+        self.predicate = predicate
+
+    def __call__(self, episode: TensorDictBase) -> bool:
+        return bool(self.predicate(episode))
+
+    def select(self, episodes: list[TensorDictBase]) -> Tensor:
+        """Answers for each episode: bool [E]."""
+        return torch.tensor([self(episode) for episode in episodes], dtype=torch.bool)
+
+    def __and__(self, other: Expert) -> Expert:
+        return _Combined("&", self, other)
+
+    def __or__(self, other: Expert) -> Expert:
+        return _Combined("|", self, other)
+
+    def __invert__(self) -> Expert:
+        return _Combined("~", self)
+
+    def __repr__(self) -> str:
+        arguments = ", ".join(str(value) for value in self.config["args"])
+        return f"{self.config['rule']}({arguments})"
+
+
+class _Combined(Expert):
+    def __init__(self, operator: str, *parts: Expert):
+        super().__init__({"rule": operator, "args": [part.config for part in parts]}, self._decide)
+        self.parts = parts
+
+    def _decide(self, episode: TensorDictBase) -> bool:
+        return bool(self.select([episode])[0])
+
+    def select(self, episodes: list[TensorDictBase]) -> Tensor:
+        masks = [part.select(episodes) for part in self.parts]
+        if self.config["rule"] == "~":
+            return ~masks[0]
+        return masks[0] & masks[1] if self.config["rule"] == "&" else masks[0] | masks[1]
+
+    def __repr__(self) -> str:
+        if self.config["rule"] == "~":
+            return f"~{self.parts[0]}"
+        return f"({self.parts[0]} {self.config['rule']} {self.parts[1]})"
+
+
+class _TopShare(Expert):
+    def __init__(self, share: float):
+        if not 0.0 < share <= 1.0:
+            raise ValueError(f"share is {share}; expected a number in (0, 1].")
+        config = {"rule": "top_share_by_return", "args": [share]}
+        super().__init__(config, lambda episode: True)
+        self.share = share
+
+    def select(self, episodes: list[TensorDictBase]) -> Tensor:
+        returns = torch.stack([_rewards(episode).double().sum() for episode in episodes])
+        keep = max(1, round(self.share * len(episodes)))
+        return returns >= returns.sort(descending=True).values[keep - 1]
+
+
+def _rewards(episode: TensorDictBase) -> Tensor:
+    return episode["next", "reward"].reshape(-1)
+
+
+def episode_length(steps: int) -> Expert:
+    """Episodes of exactly ``steps`` steps (the paper's rule for locomotion, 1000)."""
+    config = {"rule": "episode_length", "args": [steps]}
+    return Expert(config, lambda episode: episode.batch_size[0] == steps)
+
+
+def first_hit_within(low: int, high: int) -> Expert:
+    """Episodes that first earn a positive reward at a step in [low, high] (the paper's rule for mazes).
+
+    The reward of row i is that of the state after it, so that the step of the first hit is the row's number plus one.
+
+    Raises:
+        ValueError: ``low`` is larger than ``high``.
+    """
+    if low > high:
+        raise ValueError(f"first_hit_within({low}, {high}) is empty: low must not exceed high.")
+
+    def predicate(episode: TensorDictBase) -> bool:
+        hit = _rewards(episode) > 0
+        return bool(hit.any()) and low <= int(hit.float().argmax()) + 1 <= high
+
+    return Expert({"rule": "first_hit_within", "args": [low, high]}, predicate)
+
+
+def reaches_goal() -> Expert:
+    """Episodes that earn a positive reward at some step."""
+    return Expert({"rule": "reaches_goal", "args": []}, lambda episode: bool((_rewards(episode) > 0).any()))
+
+
+def subtasks_done(count: int) -> Expert:
+    """Episodes whose step reward reaches ``count`` (Kitchen: tasks in place at that step; the paper's rule is 3)."""
+    config = {"rule": "subtasks_done", "args": [count]}
+    return Expert(config, lambda episode: bool((_rewards(episode) >= count).any()))
+
+
+def top_share_by_return(share: float) -> Expert:
+    """The given share of the episodes added together, by undiscounted return; equal returns are kept together.
+
+    Raises:
+        ValueError: ``share`` lies outside (0, 1].
+    """
+    return _TopShare(share)
+
+
+RULES: dict[str, Callable[..., Expert]] = {
+    "episode_length": episode_length,
+    "first_hit_within": first_hit_within,
+    "reaches_goal": reaches_goal,
+    "subtasks_done": subtasks_done,
+    "top_share_by_return": top_share_by_return,
+}
+
+
+def expert_from_config(config: dict[str, Any]) -> Expert:
+    """Builds a rule from its ``config``.
+
+    Raises:
+        KeyError: the rule's name is not known.
+
+    Examples:
+        >>> expert_from_config({"rule": "first_hit_within", "args": [150, 600]})
+        first_hit_within(150, 600)
+    """
+    rule, args = config["rule"], config["args"]
+    if rule in ("&", "|", "~"):
+        return _Combined(rule, *(expert_from_config(part) for part in args))
+    if rule not in RULES:
+        raise KeyError(f"unknown expert rule {rule!r}; known rules are {sorted(RULES)}.")
+    return RULES[rule](*args)

@@ -1,0 +1,244 @@
+"""Minari data sets as a flat table of steps."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import torch
+from tensordict import TensorDict, TensorDictBase
+
+from torchrl_rad.data.episodes import episode_lengths, step_and_remaining
+from torchrl_rad.data.report import describe_rows
+from torchrl_rad.envs.adapter import ObservationAdapter
+
+__all__ = ["check_content", "join_stream", "load_minari"]
+
+
+def load_minari(
+    dataset_id: str,
+    adapter: Callable[[Any], np.ndarray] | None = None,
+    download: bool = False,
+) -> TensorDict:
+    """Loads any Minari data set, HDF5 or Arrow, as a flat table of steps, and checks what came.
+
+    Args:
+        dataset_id (str): for example ``"D4RL/pointmaze/umaze-v2"``. Local sets lie in ``$MINARI_DATASETS_PATH``
+            (``~/.minari/datasets``).
+        adapter (callable, optional): observations of one episode [L + 1, ...] -> array [L + 1, S]. Defaults to
+            :class:`~torchrl_rad.envs.adapter.ObservationAdapter`, which takes the entry ``"observation"`` of a dict.
+        download (bool, optional): fetch the set if it is not here. Defaults to ``False``.
+
+    Returns:
+        TensorDict [T], episodes one after the other: ``observation`` [T, S] and ``action`` [T, A] float32, ``episode``
+        [T] int64 (Minari's id), ``("next", "observation")`` [T, S] and ``("next", "reward")`` [T, 1] float32,
+        ``("next", "terminated")``, ``("next", "truncated")`` and ``("next", "done")`` [T, 1] bool.
+
+    Raises:
+        ImportError: Minari is not installed.
+        FileNotFoundError: the set is not here, and ``download`` is off or failed.
+        KeyError: the adapter names an entry that the observations lack.
+        TypeError: observations or actions are not arrays.
+        ValueError: the set cannot be read, is empty, or fails :func:`check_content`.
+
+    Examples:
+        >>> import os, tempfile, gymnasium, minari
+        >>> from unittest import mock
+        >>> space = gymnasium.spaces.Box(-9, 9, (1,))
+        >>> episode = minari.data_collector.EpisodeBuffer(
+        ...     observations=np.float32([[1], [2], [3]]), actions=np.float32([[0.1], [0.2]]), rewards=[0.0, 1.0],
+        ...     terminations=[False, False], truncations=[False, True])
+        >>> with tempfile.TemporaryDirectory() as root, mock.patch.dict(os.environ, MINARI_DATASETS_PATH=root):
+        ...     made = minari.create_dataset_from_buffers(
+        ...         "tiny-v0", [episode], observation_space=space, action_space=space, algorithm_name="a",
+        ...         author="a", author_email="a", code_permalink="a")
+        ...     steps = load_minari("tiny-v0")
+        >>> steps["next", "observation"].tolist(), steps["next", "done"].tolist()
+        ([[2.0], [3.0]], [[False], [True]])
+    """
+    dataset = _open(dataset_id, download)
+    if dataset.total_episodes == 0:
+        raise ValueError(f"Minari data set {dataset_id!r} holds no episodes; record some first.")
+    adapter = ObservationAdapter() if adapter is None else adapter
+    episodes = [_columns(episode, adapter, dataset_id) for episode in dataset.iterate_episodes()]
+    flat = {key: torch.from_numpy(np.concatenate([e.pop(key) for e in episodes])) for key in [*episodes[0]]}
+    flat["next", "done"] = flat["next", "terminated"] | flat["next", "truncated"]
+    steps = TensorDict({}, [len(flat["action"])])
+    for key, value in flat.items():
+        steps[key] = value
+    check_content(steps, dataset.total_episodes, dataset.total_steps, f"Minari data set {dataset_id!r}")
+    return steps
+
+
+def _import_minari():
+    try:
+        import minari
+    except ImportError as error:
+        raise ImportError(
+            f"Minari data sets need the package minari ({error}); "
+            'install it with pip install "torchrl_rad[offline]".'
+        ) from error
+    return minari
+
+
+def _open(dataset_id: str, download: bool):
+    """The Minari data set, from here or, if asked for, from its server."""
+    minari = _import_minari()
+    try:
+        return minari.load_dataset(dataset_id)
+    except FileNotFoundError as error:
+        absent = error
+    except ValueError as error:
+        raise ValueError(
+            f"Minari data set {dataset_id!r} is here but cannot be read ({error}). If a download was interrupted, "
+            "delete its folder and load it again with download=True."
+        ) from error
+    here = sorted(minari.list_local_datasets()) or "none"
+    message = f"Minari data set {dataset_id!r} is not here (local data sets: {here})"
+    if not download:
+        raise FileNotFoundError(
+            f"{message} and downloading is off. Pass a local id, set MINARI_DATASETS_PATH to the folder of the data "
+            "sets, or pass download=True, which needs a network."
+        ) from absent
+    try:
+        return minari.load_dataset(dataset_id, download=True)
+    except Exception as error:  # of the network library, the server, the disk: any says that it did not come
+        raise FileNotFoundError(
+            f"{message} and downloading it failed ({type(error).__name__}: {error}). Check the id and the network, or "
+            "copy the data set into the folder that MINARI_DATASETS_PATH names."
+        ) from error
+
+
+def _columns(episode, adapter, dataset_id: str) -> dict:
+    """One episode's entries as arrays [L, ...]; Minari keeps L + 1 observations."""
+    states = _states(episode, adapter, dataset_id)
+    if isinstance(episode.actions, (dict, tuple, list)):
+        raise TypeError(
+            f"Minari data set {dataset_id!r}: actions are a {type(episode.actions).__name__}, expected one array."
+        )
+    length = len(episode.rewards)
+    if len(states) != length + 1 or len(episode.actions) != length:
+        raise ValueError(
+            f"Minari data set {dataset_id!r}, episode {episode.id}: {length} rewards with {len(states)} observations "
+            f"and {len(episode.actions)} actions; expected {length + 1} and {length}. Record the episode anew."
+        )
+    return {
+        "observation": states[:-1],
+        "action": np.asarray(episode.actions, np.float32).reshape(length, -1),
+        "episode": np.full(length, episode.id, np.int64),
+        ("next", "observation"): states[1:],
+        ("next", "reward"): np.asarray(episode.rewards, np.float32).reshape(length, 1),
+        ("next", "terminated"): np.asarray(episode.terminations, bool).reshape(length, 1),
+        ("next", "truncated"): np.asarray(episode.truncations, bool).reshape(length, 1),
+    }
+
+
+def _states(episode, adapter, dataset_id: str) -> np.ndarray:
+    try:
+        states = np.asarray(adapter(episode.observations), dtype=np.float32)
+    except KeyError as error:
+        raise KeyError(f"Minari data set {dataset_id!r}: {error.args[0]}") from error
+    except (TypeError, ValueError) as error:
+        raise TypeError(
+            f"Minari data set {dataset_id!r}: {adapter} cannot make one vector of the observations ({error}). "
+            "Name entries that are arrays, or pass an adapter of your own."
+        ) from error
+    return states.reshape(len(states), -1)
+
+
+def check_content(
+    td: TensorDictBase, episodes: int, steps: int, name: str = "the data set"
+) -> None:
+    """Makes sure that a data set came as a whole: its size, finite numbers, and that they are not all 0.
+
+    A loader that fails silently gives zeros or a part of the data, and training on it runs without a complaint.
+
+    Args:
+        td (TensorDict): [T]: ``observation``, ``action``, ``episode`` [T], ``("next", "observation")``, ``("next",
+            "reward")``.
+        episodes (int): number of episodes expected.
+        steps (int): number of steps expected.
+        name (str, optional): what to call the data in messages.
+
+    Raises:
+        ValueError: there are more or fewer episodes or steps; NaN or Inf, named by entry, episode and step; or
+            observations or actions are all 0. Rewards may be: the data may not have been labelled yet.
+
+    Examples:
+        >>> zeros = TensorDict({"observation": torch.zeros(2, 1), "action": torch.ones(2, 1), "episode": torch.zeros(2),
+        ...     "next": {"observation": torch.ones(2, 1), "reward": torch.ones(2, 1)}}, [2])
+        >>> check_content(zeros, episodes=1, steps=2)
+        Traceback (most recent call last):
+        ...
+        ValueError: the data set: 'observation' is 0 in all 2 rows; the data was not read. Load it anew.
+    """
+    came = {"episodes": len(torch.unique_consecutive(td["episode"])), "steps": len(td)}
+    expected = {"episodes": episodes, "steps": steps}
+    if came != expected:
+        raise ValueError(
+            f"{name}: {came['episodes']} episodes with {came['steps']} steps came, expected {episodes} with {steps}. "
+            "The set is incomplete or damaged; delete its folder and fetch it anew."
+        )
+    for key in ("observation", "action", ("next", "observation"), ("next", "reward")):
+        bad = ~td[key].isfinite().all(-1)
+        if bad.any():
+            raise ValueError(
+                f"{name}: NaN or Inf in {key!r} at {describe_rows(td['episode'], bad)}. "
+                "Drop these episodes or mend them."
+            )
+        if key != ("next", "reward") and not td[key].any():
+            raise ValueError(f"{name}: {key!r} is 0 in all {len(td)} rows; the data was not read. Load it anew.")
+
+
+def join_stream(td: TensorDictBase, max_steps: int, atol: float = 1e-6) -> TensorDictBase:
+    """Joins episodes that are one physical stream, and cuts it anew into episodes of at most ``max_steps`` rows.
+
+    D4RL's PointMaze sets in Minari begin a new episode whenever a goal is reached, although the ball moves on. An
+    episode is joined to the one before it if its first observation is that one's last ``("next", "observation")``.
+    Rewards stay as they are, those of the goals of the recording: label the data for the goal of the evaluation
+    afterwards. Observations that hold the goal never join, since it changes.
+
+    Args:
+        td (TensorDict): [T], whole episodes in recorded order: ``observation`` [T, S], ``episode`` [T] int64,
+            ``("next", "observation")`` [T, S], ``("next", "terminated")`` [T, 1] bool; anything else is passed on.
+        max_steps (int): rows of an episode; the last one of a stream may be shorter.
+        atol (float, optional): largest difference of any feature that counts as equal. Defaults to ``1e-6``.
+
+    Returns:
+        A new TensorDict [T] with the same entries; set anew are ``episode`` (0, 1, ...), ``("next", "truncated")`` and
+        ``("next", "done")`` (True in the last row of each episode), ``("next", "terminated")`` (kept in the last row
+        of a stream, False everywhere else).
+
+    Raises:
+        ValueError: ``max_steps`` is below 1, or the rows of an episode do not lie together.
+
+    Examples:
+        >>> flag = torch.tensor([[False], [True], [False], [True], [True]])
+        >>> steps = TensorDict({"observation": torch.tensor([[0.0], [1.0], [2.0], [3.0], [9.0]]),
+        ...     "episode": torch.tensor([4, 4, 5, 5, 6]), "next": {
+        ...     "observation": torch.tensor([[1.0], [2.0], [3.0], [4.0], [9.5]]), "terminated": flag & False,
+        ...     "truncated": flag, "done": flag}}, [5])
+        >>> joined = join_stream(steps, max_steps=3)
+        >>> joined["episode"].tolist(), joined["next", "done"].squeeze(-1).tolist()
+        ([0, 0, 0, 1, 2], [False, False, True, True, True])
+    """
+    if max_steps < 1:
+        raise ValueError(f"max_steps is {max_steps}; an episode has at least 1 row.")
+    out = td.clone(recurse=False)
+    if len(td) == 0:
+        return out
+    lengths = episode_lengths(td)
+    last = lengths.cumsum(0) - 1
+    first = last + 1 - lengths
+    gap = (td["observation"][first[1:]] - td["next", "observation"][last[:-1]]).abs().flatten(1).amax(-1)
+    begins = torch.cat([torch.ones(1, dtype=torch.bool), ~(gap <= atol)])  # NaN joins nothing
+    stream_lengths = torch.diff(first[begins], append=torch.tensor([len(td)]))
+    step, remaining = step_and_remaining(stream_lengths)
+    stream_end = remaining == 0
+    end = (stream_end | ((step + 1) % max_steps == 0)).unsqueeze(-1)
+    out["episode"] = (step % max_steps == 0).cumsum(0) - 1
+    out["next", "terminated"] = td["next", "terminated"] & stream_end.unsqueeze(-1)
+    out["next", "truncated"] = end
+    out["next", "done"] = end.clone()
+    return out

@@ -1,0 +1,175 @@
+"""The D4RL Maze2D protocol in gymnasium-robotics' PointMaze."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import gymnasium as gym
+import gymnasium_robotics
+import numpy as np
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+from torchrl.envs import DoubleToFloat, GymWrapper, SerialEnv, TransformedEnv
+from torchrl.envs.transforms import Compose, InitTracker
+
+from torchrl_rad.envs.adapter import ObservationAdapter
+
+__all__ = ["MAZES", "FixedGoalMaze", "MazeTask", "make_maze_env", "maze_task", "relabel_goal"]
+
+GOAL_RADIUS = 0.5  # D4RL's; gymnasium-robotics' own is 0.45
+RESET_NOISE = 0.1  # D4RL's start noise in cells; gymnasium-robotics' own is 0.25
+
+
+@dataclass(frozen=True)
+class MazeTask:
+    """What the D4RL Maze2D protocol fixes for one maze.
+
+    Attributes:
+        name: name of the task.
+        env_id: gymnasium id of the maze.
+        goal_cell: (row, column) of the fixed goal.
+        max_steps: length of an episode.
+        reference_scores: returns of D4RL's random policy and controller (0 and 100 of the normalised
+            score; D4RL ``d4rl/infos.py``, maze2d-*-v1).
+        expert_steps: first and last step at which an expert episode of the paper first hits the goal
+            (RAD, appendix "Implementation Details").
+    """
+
+    name: str
+    env_id: str
+    goal_cell: tuple[int, int]
+    max_steps: int
+    reference_scores: tuple[float, float]
+    expert_steps: tuple[int, int]
+
+    def normalised_score(self, episode_return: float | np.ndarray) -> Any:
+        """Return of an episode on D4RL's scale: 0 is its random policy, 100 its controller."""
+        low, high = self.reference_scores
+        return 100.0 * (episode_return - low) / (high - low)
+
+
+MAZES = {
+    "umaze": MazeTask("umaze", "PointMaze_UMaze-v3", (1, 1), 300, (23.85, 161.86), (200, 300)),
+    "medium": MazeTask("medium", "PointMaze_Medium-v3", (6, 6), 600, (13.13, 277.39), (400, 600)),
+    "large": MazeTask("large", "PointMaze_Large-v3", (7, 9), 800, (6.7, 273.99), (400, 800)),
+}
+
+
+def maze_task(name: str) -> MazeTask:
+    """The protocol of one maze by name.
+
+    Raises:
+        KeyError: the maze is not known.
+
+    Examples:
+        >>> maze_task("medium").goal_cell
+        (6, 6)
+    """
+    if name not in MAZES:
+        raise KeyError(f"unknown maze {name!r}; known mazes are {sorted(MAZES)}.")
+    return MAZES[name]
+
+
+class FixedGoalMaze(gym.Wrapper):
+    """PointMaze with a fixed goal cell, uniform start cells and D4RL's reward.
+
+    The observation is the flat state (x, y, vx, vy); the reward is 1 for every step that ends within 0.5 of the
+    centre of the goal cell; an episode ends at the time limit only.
+
+    Args:
+        task (MazeTask): the protocol.
+        goal_cell (tuple of int, optional): another goal cell (row, column).
+        reset_cell (tuple of int, optional): a fixed start cell instead of a uniform one.
+
+    Examples:
+        >>> env = FixedGoalMaze(maze_task("umaze"))
+        >>> observation, _ = env.reset(seed=0)
+        >>> observation.shape, env.goal.tolist()
+        ((4,), [-1.0, 1.0])
+    """
+
+    def __init__(
+        self,
+        task: MazeTask,
+        goal_cell: tuple[int, int] | None = None,
+        reset_cell: tuple[int, int] | None = None,
+    ):
+        gym.register_envs(gymnasium_robotics)
+        super().__init__(gym.make(task.env_id, max_episode_steps=task.max_steps))
+        self.adapter = ObservationAdapter()
+        self.unwrapped.position_noise_range = RESET_NOISE
+        self.maze = self.unwrapped.maze
+        self.goal_cell = np.asarray(task.goal_cell if goal_cell is None else goal_cell)
+        self.free_cells = free_cells(self.maze.maze_map)
+        self.reset_cells = self.free_cells if reset_cell is None else np.asarray([reset_cell])
+        for cell in (self.goal_cell, *self.reset_cells):
+            if not (self.free_cells == cell).all(-1).any():
+                raise ValueError(f"cell {tuple(cell.tolist())} of {task.env_id} is a wall or outside the map.")
+        self.goal = self.maze.cell_rowcol_to_xy(self.goal_cell)
+        self.observation_space = gym.spaces.Box(-np.inf, np.inf, (4,), np.float32)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None):
+        if seed is not None:
+            self.unwrapped.reset(seed=seed)  # seeds the generator that draws the start cell
+        cell = self.reset_cells[self.unwrapped.np_random.integers(len(self.reset_cells))]
+        cells = {"goal_cell": self.goal_cell, "reset_cell": cell}
+        observation, _ = self.env.reset(options=cells)
+        return self.adapter(observation), {}
+
+    def step(self, action):
+        observation, _, terminated, truncated, _ = self.env.step(action)
+        state = self.adapter(observation)
+        reward = float(np.linalg.norm(state[:2] - self.goal) <= GOAL_RADIUS)
+        return state, reward, terminated, truncated, {}
+
+
+def free_cells(maze_map: list[list[Any]]) -> np.ndarray:
+    """(row, column) of every free cell of a maze map, in reading order: int [n, 2]."""
+    return np.asarray([(r, c) for r, row in enumerate(maze_map) for c, v in enumerate(row) if v != 1])
+
+
+def relabel_goal(episodes: TensorDictBase, goal: np.ndarray | Tensor) -> TensorDictBase:
+    """Gives recorded steps the reward of another goal: 1 where the next state is within 0.5 of it.
+
+    Args:
+        episodes (TensorDictBase): flat steps with ``("next", "observation")``, whose first two entries are x, y.
+        goal: x, y of the goal.
+
+    Returns:
+        A shallow copy with ``("next", "reward")`` [T, 1] float32 replaced.
+
+    Examples:
+        >>> import torch
+        >>> steps = TensorDict({"next": {"observation": torch.tensor([[0.0, 0.4], [0.0, 0.6]])}}, [2])
+        >>> relabel_goal(steps, [0.0, 0.0])["next", "reward"].squeeze(-1).tolist()
+        [1.0, 0.0]
+    """
+    goal = torch.as_tensor(np.asarray(goal), dtype=torch.float32)
+    position = episodes["next", "observation"][..., :2]
+    reward = ((position - goal).norm(dim=-1, keepdim=True) <= GOAL_RADIUS).float()
+    out = episodes.copy()
+    out["next"] = TensorDict({**dict(episodes["next"].items()), "reward": reward}, episodes.batch_size)
+    return out
+
+
+def make_maze_env(
+    task: MazeTask, rows: int, seed: int = 0, goal_cell: tuple[int, int] | None = None
+) -> TransformedEnv:
+    """A TorchRL environment with ``rows`` independent mazes; row by row the episodes depend on the seed alone.
+
+    Args:
+        task (MazeTask): the protocol.
+        rows (int): number of mazes.
+        seed (int, optional): seed of the start states. Defaults to ``0``.
+        goal_cell (tuple of int, optional): another goal cell.
+    """
+
+    def make_row() -> TransformedEnv:
+        # the cast sits inside each row: outside a batched env it breaks partial steps
+        return TransformedEnv(GymWrapper(FixedGoalMaze(task, goal_cell)), DoubleToFloat())
+
+    env = TransformedEnv(SerialEnv(rows, make_row), Compose(InitTracker()))
+    env.set_seed(seed)
+    return env

@@ -1,0 +1,29 @@
+"""TS, SE and PL as TensorDict modules."""
+
+from torchrl_rad.modules.diffuser_lite import DiffuserLitePlanner, plan_levels
+from torchrl_rad.modules.dit import DiT
+from torchrl_rad.modules.inverse import InverseDynamics, inverse_dynamics_actor
+from torchrl_rad.modules.normalizer import Normalizer
+from torchrl_rad.modules.placement import TargetPlacement
+from torchrl_rad.modules.process import Diffusion, RectifiedFlow, make_process
+from torchrl_rad.modules.return_model import ReturnModel
+from torchrl_rad.modules.sampling import sample_plan
+from torchrl_rad.modules.step import StepEstimator
+from torchrl_rad.modules.target import RetrievalTargetModule
+
+__all__ = [
+    "DiT",
+    "Diffusion",
+    "DiffuserLitePlanner",
+    "InverseDynamics",
+    "Normalizer",
+    "RectifiedFlow",
+    "RetrievalTargetModule",
+    "ReturnModel",
+    "StepEstimator",
+    "TargetPlacement",
+    "inverse_dynamics_actor",
+    "make_process",
+    "plan_levels",
+    "sample_plan",
+]

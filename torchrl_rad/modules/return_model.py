@@ -1,0 +1,52 @@
+"""The return of a plan, from its coarse states."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from torchrl_rad.modules.normalizer import Normalizer
+
+__all__ = ["ReturnModel"]
+
+
+class ReturnModel(nn.Module):
+    """MLP that predicts C(tau) of a plan (J of RAD, equation "loss:g") from the states on its first level's grid.
+
+    Args:
+        normalizer (Normalizer): of states.
+        tokens (int): n, grid states of a plan.
+        width (int, optional): Defaults to ``256``.
+
+    Examples:
+        >>> model = ReturnModel(Normalizer.identity(4), tokens=5)
+        >>> model(torch.zeros(3, 5, 4)).shape
+        torch.Size([3])
+    """
+
+    mean: Tensor
+    deviation: Tensor
+
+    def __init__(self, normalizer: Normalizer, tokens: int, width: int = 256):
+        super().__init__()
+        self.normalizer = normalizer
+        self.net = nn.Sequential(
+            nn.Linear(tokens * len(normalizer.mean), width), nn.SiLU(),
+            nn.Linear(width, width), nn.SiLU(),
+            nn.Linear(width, 1),
+        )  # fmt: skip
+        self.register_buffer("mean", torch.zeros(()))
+        self.register_buffer("deviation", torch.ones(()))
+
+    def fit_scale(self, returns: Tensor) -> ReturnModel:
+        """Takes mean and deviation of recorded returns as the unit of the network's output."""
+        self.mean.fill_(float(returns.mean()))
+        self.deviation.fill_(max(float(returns.std()), 1e-6))
+        return self
+
+    def standardised(self, states: Tensor) -> Tensor:
+        """Predicted return [*B] of raw states [*B, n, S], in units of the deviation."""
+        return self.net(self.normalizer(states).flatten(-2)).squeeze(-1)
+
+    def forward(self, states: Tensor) -> Tensor:
+        return self.standardised(states) * self.deviation + self.mean

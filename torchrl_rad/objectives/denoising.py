@@ -1,0 +1,176 @@
+"""L_d: training a planner to in-paint towards pseudo targets."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from tensordict import TensorDict, TensorDictBase, TensorDictParams
+from tensordict.nn import dispatch
+from tensordict.utils import NestedKey
+from torch import Tensor
+from torchrl.objectives.common import LossModule
+
+from torchrl_rad.modules.diffuser_lite import DiffuserLitePlanner, PlanNetworks
+from torchrl_rad.objectives.common import window_masks
+
+__all__ = ["DenoisingLoss"]
+
+
+class DenoisingLoss(LossModule):
+    r"""Generation loss with pseudo targets (L_d of RAD, equation "loss:difusion"), for every level of a planner.
+
+    Each window of H states gives each level a random piece of its span. A step i, uniform over the span, chooses the pseudo
+    target, which the planner's own placement puts on the grid; a share of the pieces has none, so that rows without a target
+    can be planned by the same network. Known states (the first; the last on finer levels; the target) are shown clean and
+    do not enter the loss:
+
+    .. math:: L_d = E \| w \odot (1 - m) \odot (\phi_\theta(\hat\tau^k, m, k) - y) \|^2
+
+    with y the velocity (flow) or the clean states (diffusion), m the mask of the known ones and w the weight of the state
+    after the current one, which is what a plan is used for.
+
+    Args:
+        planner (DiffuserLitePlanner): whose networks are trained.
+
+    Keyword Args:
+        no_target (float, optional): share of pieces without a target; a planner with ``targets=False`` has none at all.
+            Defaults to ``0.2``.
+        next_weight (float, optional): weight of grid point 1. Defaults to ``10.0`` (DiffuserLite's).
+        delay (bool, optional): keep target parameters, for :class:`torchrl.objectives.SoftUpdate`. Defaults to ``False``.
+        reduction (str, optional): ``"none"``, ``"mean"`` or ``"sum"`` over windows. Defaults to ``"mean"``.
+
+    .. note:: The tensordict passed to :meth:`forward` must contain ``self.tensor_keys.observation``, windows [*B, H, S] of
+        raw states. Masks (``("collector", "mask")``, ...) may be [*B] or [*B, H]: a window counts if all its steps do.
+
+    Examples:
+        >>> from torchrl_rad import InverseDynamics, Normalizer
+        >>> states = Normalizer.identity(2)
+        >>> planner = DiffuserLitePlanner(states, InverseDynamics(states, states, 1), horizon=9, jumps=(4, 1), width=32)
+        >>> loss = DenoisingLoss(planner)
+        >>> out = loss(TensorDict({"observation": torch.randn(6, 9, 2)}, [6]))
+        >>> out["loss_denoising"].shape, sorted(out.keys())
+        (torch.Size([]), ['level_0', 'level_1', 'loss_denoising'])
+    """
+
+    @dataclass
+    class _AcceptedKeys:
+        """Keys that can be set with ``set_keys``.
+
+        Attributes:
+            observation (NestedKey): windows of states. Defaults to ``"observation"``.
+        """
+
+        observation: NestedKey = "observation"
+
+    tensor_keys: _AcceptedKeys
+    default_keys = _AcceptedKeys
+    network: PlanNetworks
+    network_params: TensorDictParams
+    target_network_params: TensorDictParams
+
+    def __init__(
+        self,
+        planner: DiffuserLitePlanner,
+        *,
+        no_target: float = 0.2,
+        next_weight: float = 10.0,
+        delay: bool = False,
+        reduction: Literal["none", "mean", "sum"] | None = None,
+    ):
+        super().__init__()
+        if not 0.0 <= no_target <= 1.0:
+            raise ValueError(f"no_target is {no_target}; expected a share in [0, 1].")
+        self._in_keys: list[NestedKey] | None = None
+        self.convert_to_functional(planner.networks, "network", create_target_params=delay)
+        self.planner_normalizer = planner.normalizer
+        self.levels, self.process, self.placement = planner.levels, planner.process, planner.placement
+        self.horizon = planner.horizon
+        self.no_target = no_target if planner.targets else 1.0
+        self.next_weight = next_weight
+        self.reduction = "mean" if reduction is None else reduction
+
+    @property
+    def out_keys(self) -> list[str]:
+        return ["loss_denoising", *(f"level_{number}" for number in range(len(self.levels)))]
+
+    @out_keys.setter
+    def out_keys(self, value: list[str]) -> None:
+        self._out_keys = value
+
+    @property
+    def in_keys(self) -> list[NestedKey]:
+        if self._in_keys is None:
+            self._in_keys = [self.tensor_keys.observation]
+        return self._in_keys
+
+    @in_keys.setter
+    def in_keys(self, value: list[NestedKey]) -> None:
+        self._in_keys = value
+
+    def set_keys(self, **kwargs: NestedKey) -> None:
+        super().set_keys(**kwargs)
+        self._in_keys = None
+
+    @dispatch
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Loss of a batch of windows, and the mean of each level."""
+        windows = tensordict.get(self.tensor_keys.observation)
+        if windows.ndim < 2 or windows.shape[-2] != self.horizon:
+            raise ValueError(
+                f"{self.tensor_keys.observation!r} is {tuple(windows.shape)}; expected windows [*B, {self.horizon}, S], "
+                "the horizon that the planner was built for."
+            )
+        shape = windows.shape[:-2]
+        masks, counted = window_masks(self._loss_mask_keys(), tensordict, shape)
+        if counted is not None:  # what is masked may be NaN, also in the backward pass
+            windows = torch.where(counted[..., None, None], windows, 0.0)
+        windows = self.planner_normalizer(windows.reshape(-1, *windows.shape[-2:]))
+        with self.network_params.to_module(self.network):
+            losses = [self._level(number, windows).reshape(shape) for number in range(len(self.levels))]
+        out = {"loss_denoising": self._reduce_loss(torch.stack(losses).sum(0), masks)}
+        for number, value in enumerate(losses):
+            out[f"level_{number}"] = self._reduce_loss(value.detach(), masks, reduction="mean")
+        out = TensorDict(out)
+        self._clear_weakrefs(tensordict, out, "network_params", "target_network_params")
+        return out
+
+    def _level(self, number: int, windows: Tensor) -> Tensor:
+        """Loss of each window [B] on one level."""
+        clean, mask = self.pieces(number, windows)
+        time = torch.rand(len(clean), device=clean.device)
+        noise = torch.randn_like(clean)
+        noisy = torch.where(mask, clean, self.process.corrupt(clean, noise, time[:, None, None]))
+        error = self.network(number, noisy, mask, time).float() - self.process.target(clean, noise)
+        weight = torch.ones(clean.shape[1], device=clean.device)
+        weight[1] = self.next_weight
+        error = torch.where(mask, 0.0, error.square()) * weight[:, None]
+        return error.mean((-2, -1))
+
+    def pieces(self, number: int, windows: Tensor) -> tuple[Tensor, Tensor]:
+        """A random piece of each window on one level's grid, with the pseudo target in it.
+
+        Args:
+            number (int): the level.
+            windows (Tensor): [B, H, S].
+
+        Returns:
+            States [B, n, S] and the mask of the known ones, bool [B, n, 1].
+        """
+        level, count, device = self.levels[number], len(windows), windows.device
+        rows = torch.arange(count, device=device)
+        begin = torch.randint(self.horizon - level.span, (count,), device=device)
+        grid = begin[:, None] + torch.arange(level.tokens, device=device) * level.jump  # [B, n]
+        clean = windows[rows[:, None], grid]
+        mask = torch.zeros(count, level.tokens, dtype=torch.bool, device=device)
+        mask[:, 0] = True
+        mask[:, -1] = number > 0
+        step = torch.randint(1, level.span + 1, (count,), device=device)
+        place = self.placement(step, number, *level)
+        pinned = place.active & (torch.rand(count, device=device) >= self.no_target)
+        # a shifted placement pins the window's own state; others move the state at `step` to the grid point
+        moved = windows[rows, begin + place.time]
+        here = (torch.arange(level.tokens, device=device) == place.token[:, None]) & pinned[:, None]
+        clean = torch.where(here[..., None], moved[:, None], clean)
+        return clean, (mask | here)[..., None]

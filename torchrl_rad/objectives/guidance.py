@@ -1,0 +1,143 @@
+"""L_g: training the return model."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from tensordict import TensorDict, TensorDictBase, TensorDictParams
+from tensordict.nn import dispatch
+from tensordict.utils import NestedKey
+from torch import Tensor
+from torchrl.objectives.common import LossModule
+
+from torchrl_rad.modules.return_model import ReturnModel
+from torchrl_rad.objectives.common import window_masks
+
+__all__ = ["ReturnGuidanceLoss", "plan_return"]
+
+
+def plan_return(reward: Tensor, value: Tensor, gamma: float) -> Tensor:
+    r"""Return of a window of H steps, continued by a value (C of RAD, section "Model Learning").
+
+    .. math:: C(\tau) = \sum_{t=0}^{H-2} \gamma^t r_t + \gamma^{H-1} V(s_{H-1})
+
+    Args:
+        reward (Tensor): [*B, H].
+        value (Tensor): [*B], of the last state.
+        gamma (float): discount.
+
+    Returns:
+        [*B].
+
+    Examples:
+        >>> plan_return(torch.tensor([[1.0, 1.0, 9.0]]), torch.tensor([8.0]), 0.5)
+        tensor([3.5000])
+    """
+    length = reward.shape[-1]
+    discount = gamma ** torch.arange(length, device=reward.device, dtype=torch.float32)
+    return (reward[..., :-1] * discount[:-1]).sum(-1) + discount[-1] * value
+
+
+class ReturnGuidanceLoss(LossModule):
+    r"""Mean squared error of the return model (L_g of RAD, equation "loss:g").
+
+    .. math:: L_g = E (J_\phi(\tau) - C(\tau))^2
+
+    in units of the model's deviation.
+
+    Args:
+        return_model (ReturnModel): J.
+
+    Keyword Args:
+        jump (int): step of the grid on which J sees a window.
+        gamma (float, optional): discount. Defaults to ``0.99``.
+        reduction (str, optional): ``"none"``, ``"mean"`` or ``"sum"`` over windows. Defaults to ``"mean"``.
+
+    .. note:: The tensordict passed to :meth:`forward` must contain ``self.tensor_keys.observation`` [*B, H, S],
+        ``reward`` [*B, H, 1] and ``value`` [*B, H, 1] or [*B, H], whose last entry is V(s_{H-1}): the recorded
+        return-to-go, or a learned value.
+
+    Examples:
+        >>> from torchrl_rad import Normalizer
+        >>> loss = ReturnGuidanceLoss(ReturnModel(Normalizer.identity(2), tokens=3), jump=4)
+        >>> windows = TensorDict({"observation": torch.zeros(5, 9, 2), "next": {"reward": torch.zeros(5, 9, 1)},
+        ...     "return_to_go": torch.zeros(5, 9)}, [5])
+        >>> loss(windows)["loss_guidance"].shape
+        torch.Size([])
+    """
+
+    @dataclass
+    class _AcceptedKeys:
+        """Keys that can be set with ``set_keys``.
+
+        Attributes:
+            observation (NestedKey): windows of states. Defaults to ``"observation"``.
+            reward (NestedKey): their rewards. Defaults to ``("next", "reward")``.
+            value (NestedKey): values of the states. Defaults to ``"return_to_go"``.
+        """
+
+        observation: NestedKey = "observation"
+        reward: NestedKey = ("next", "reward")
+        value: NestedKey = "return_to_go"
+
+    tensor_keys: _AcceptedKeys
+    default_keys = _AcceptedKeys
+    out_keys = ["loss_guidance", "return_error"]
+    return_model: ReturnModel
+    return_model_params: TensorDictParams
+    target_return_model_params: TensorDictParams
+
+    def __init__(
+        self,
+        return_model: ReturnModel,
+        *,
+        jump: int,
+        gamma: float = 0.99,
+        reduction: Literal["none", "mean", "sum"] | None = None,
+    ):
+        super().__init__()
+        self._in_keys: list[NestedKey] | None = None
+        self.convert_to_functional(return_model, "return_model")
+        self.jump, self.gamma = jump, gamma
+        self.reduction = "mean" if reduction is None else reduction
+
+    @property
+    def in_keys(self) -> list[NestedKey]:
+        if self._in_keys is None:
+            self._in_keys = [self.tensor_keys.observation, self.tensor_keys.reward, self.tensor_keys.value]
+        return self._in_keys
+
+    @in_keys.setter
+    def in_keys(self, value: list[NestedKey]) -> None:
+        self._in_keys = value
+
+    def set_keys(self, **kwargs: NestedKey) -> None:
+        super().set_keys(**kwargs)
+        self._in_keys = None
+
+    @dispatch
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Loss of a batch of windows, and the mean absolute error in units of return."""
+        states = tensordict.get(self.tensor_keys.observation)
+        shape = states.shape[:-2]
+        reward = tensordict.get(self.tensor_keys.reward).reshape(*shape, -1)
+        value = tensordict.get(self.tensor_keys.value).reshape(*shape, -1)[..., -1]
+        masks, counted = window_masks(self._loss_mask_keys(), tensordict, shape)
+        target = plan_return(reward, value, self.gamma)
+        if counted is not None:  # what is masked may be NaN, also in the backward pass
+            states = torch.where(counted[..., None, None], states, 0.0)
+            target = torch.where(counted, target, 0.0)
+        with self.return_model_params.to_module(self.return_model):
+            predicted = self.return_model.standardised(states[..., :: self.jump, :])
+            unit, centre = self.return_model.deviation, self.return_model.mean
+        error = predicted - (target - centre) / unit
+        out = TensorDict(
+            {
+                "loss_guidance": self._reduce_loss(error.square(), masks),
+                "return_error": self._reduce_loss((error * unit).abs().detach(), masks, reduction="mean"),
+            }
+        )
+        self._clear_weakrefs(tensordict, out, "return_model_params")
+        return out

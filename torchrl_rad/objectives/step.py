@@ -1,0 +1,143 @@
+"""L_e: training the step estimator."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+import torch.nn.functional as F
+from tensordict import TensorDict, TensorDictBase, TensorDictParams
+from tensordict.nn import dispatch
+from tensordict.utils import NestedKey
+from torch import Tensor
+from torchrl.objectives.common import LossModule
+
+from torchrl_rad.modules.step import StepEstimator
+from torchrl_rad.objectives.common import window_masks
+
+__all__ = ["StepEstimationLoss", "draw_step_pairs"]
+
+
+def draw_step_pairs(windows: Tensor, generator: torch.Generator | None = None) -> TensorDict:
+    """Pairs (s_t, s_{t+i}) with i uniform in 1..H-1 and t uniform in what room is left, one from each window.
+
+    A window lies inside one episode, and so does a pair.
+
+    Args:
+        windows (Tensor): [B, H, S].
+        generator (torch.Generator, optional): source of randomness.
+
+    Returns:
+        TensorDict [B] with ``observation``, ``target`` [B, S] and ``target_step`` [B, 1] int64.
+
+    Examples:
+        >>> windows = torch.arange(9.0)[None, :, None].expand(4, 9, 1)
+        >>> pairs = draw_step_pairs(windows)
+        >>> bool((pairs["target"] - pairs["observation"] == pairs["target_step"]).all())
+        True
+    """
+    count, horizon, _ = windows.shape
+    rows = torch.arange(count, device=windows.device)
+    step = torch.randint(1, horizon, (count,), generator=generator, device=windows.device)
+    room = (horizon - step).float()
+    begin = (torch.rand(count, generator=generator, device=windows.device) * room).long()
+    pairs = {"observation": windows[rows, begin], "target": windows[rows, begin + step], "target_step": step[:, None]}
+    return TensorDict(pairs, [count])
+
+
+class StepEstimationLoss(LossModule):
+    r"""Cross entropy of the step estimator (L_e of RAD, equation "loss:e").
+
+    .. math:: L_e = -E \log e[i]
+
+    with softmax over the classes. The paper prints a sigmoid and this loss; nothing then pushes the other classes down, so
+    ``activation="sigmoid"`` of the estimator is trained one class against the rest.
+
+    Args:
+        estimator (StepEstimator): f_e.
+
+    Keyword Args:
+        reduction (str, optional): ``"none"``, ``"mean"`` or ``"sum"``. Defaults to ``"mean"``.
+
+    .. note:: The tensordict passed to :meth:`forward` must contain ``self.tensor_keys.observation`` and ``target``
+        [*B, S] and ``target_step`` [*B, 1] int64, the true number of steps, 1 to H - 1 (see :func:`draw_step_pairs`).
+
+    Examples:
+        >>> from torchrl_rad import Normalizer
+        >>> loss = StepEstimationLoss(StepEstimator(Normalizer.identity(2), horizon=9))
+        >>> out = loss(draw_step_pairs(torch.randn(5, 9, 2)))
+        >>> sorted(out.keys())
+        ['loss_step', 'step_error']
+    """
+
+    @dataclass
+    class _AcceptedKeys:
+        """Keys that can be set with ``set_keys``.
+
+        Attributes:
+            observation (NestedKey): state. Defaults to ``"observation"``.
+            target (NestedKey): later state of the same episode. Defaults to ``"target"``.
+            target_step (NestedKey): steps between them. Defaults to ``"target_step"``.
+        """
+
+        observation: NestedKey = "observation"
+        target: NestedKey = "target"
+        target_step: NestedKey = "target_step"
+
+    tensor_keys: _AcceptedKeys
+    default_keys = _AcceptedKeys
+    out_keys = ["loss_step", "step_error"]
+    estimator: StepEstimator
+    estimator_params: TensorDictParams
+    target_estimator_params: TensorDictParams
+
+    def __init__(self, estimator: StepEstimator, *, reduction: Literal["none", "mean", "sum"] | None = None):
+        super().__init__()
+        self._in_keys: list[NestedKey] | None = None
+        self.convert_to_functional(estimator, "estimator")
+        self.reduction = "mean" if reduction is None else reduction
+
+    @property
+    def in_keys(self) -> list[NestedKey]:
+        if self._in_keys is None:
+            self._in_keys = [self.tensor_keys.observation, self.tensor_keys.target, self.tensor_keys.target_step]
+        return self._in_keys
+
+    @in_keys.setter
+    def in_keys(self, value: list[NestedKey]) -> None:
+        self._in_keys = value
+
+    def set_keys(self, **kwargs: NestedKey) -> None:
+        super().set_keys(**kwargs)
+        self._in_keys = None
+
+    @dispatch
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Loss of a batch of pairs, and the mean absolute error in steps."""
+        state = tensordict.get(self.tensor_keys.observation)
+        target = tensordict.get(self.tensor_keys.target)
+        step = tensordict.get(self.tensor_keys.target_step)
+        shape = state.shape[:-1]
+        masks, counted = window_masks(self._loss_mask_keys(), tensordict, shape)
+        if counted is not None:  # what is masked may be NaN, also in the backward pass
+            state, target = (torch.where(counted[..., None], value, 0.0) for value in (state, target))
+        with self.estimator_params.to_module(self.estimator):
+            logits = self.estimator.logits(state, target)
+            error = (self.estimator._steps(logits.detach()) - step).abs().float().squeeze(-1)
+        out = TensorDict(
+            {
+                "loss_step": self._reduce_loss(self._entropy(logits, step.squeeze(-1) - 1), masks),
+                "step_error": self._reduce_loss(error, masks, reduction="mean"),
+            }
+        )
+        self._clear_weakrefs(tensordict, out, "estimator_params")
+        return out
+
+    def _entropy(self, logits: Tensor, label: Tensor) -> Tensor:
+        """Loss of each pair [*B]; ``label`` counts from 0."""
+        label = label.clamp(0, logits.shape[-1] - 1)
+        if self.estimator.activation == "softmax":
+            return F.cross_entropy(logits.flatten(0, -2), label.flatten(), reduction="none").reshape(label.shape)
+        one_hot = F.one_hot(label, logits.shape[-1]).to(logits.dtype)
+        return F.binary_cross_entropy_with_logits(logits, one_hot, reduction="none").sum(-1)

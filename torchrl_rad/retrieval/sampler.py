@@ -1,0 +1,194 @@
+"""The sampler of an expert database: uniform rows for training, nearest rows for a query."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+from torch import Tensor
+from torchrl.data.replay_buffers.samplers import Sampler
+
+from torchrl_rad.retrieval.search import Metric, ScanIndex, TreeIndex, build_index
+
+__all__ = ["RetrievalSampler", "storage_revision"]
+
+
+def storage_revision(storage: Any) -> tuple[int, int, int | None]:
+    """What a cache made from a storage must be keyed on; in-place writes on leaves do not show in it."""
+    return id(storage), len(storage), getattr(storage, "_mutation_revision", None)
+
+
+class RetrievalSampler(Sampler):
+    """Finds the rows of a storage that are most similar to a query (TS of RAD, first step).
+
+    :meth:`sample` draws rows uniformly, as any training batch wants them; :meth:`search` answers queries. The search
+    structure is built at the first query, again when the storage changed (see :meth:`invalidate`), and is never pickled.
+
+    Args:
+        metric (str, optional): ``"cosine"`` or ``"euclidean"`` (similarity 1 / (1 + d)). Defaults to ``"cosine"``.
+        dims (sequence of int, optional): entries of the state that are compared. Defaults to all.
+        k (int, optional): number of neighbours. Defaults to ``500``.
+        threshold (float, optional): a neighbour is at least this similar; in [0, 1]. Defaults to ``0.8``.
+        normalize (bool, optional): compare states standardised by the mean and deviation of the storage.
+            Defaults to ``False``.
+        backend (str, optional): ``"auto"``, ``"scan"`` or ``"tree"``; all are exact. Defaults to ``"auto"``.
+        key (NestedKey, optional): entry of the storage that is searched. Defaults to ``"observation"``.
+
+    Raises:
+        ValueError: an argument has a value that it cannot have.
+
+    Examples:
+        >>> from tensordict import TensorDict
+        >>> from torchrl.data import LazyTensorStorage
+        >>> storage = LazyTensorStorage(4)
+        >>> storage.set(range(3), TensorDict({"observation": torch.tensor([[0.0], [1.0], [2.0]])}, [3]))
+        >>> sampler = RetrievalSampler(metric="euclidean", k=2, threshold=0.5)
+        >>> index, info = sampler.search(storage, torch.tensor([[1.8]]))
+        >>> index, info["valid"]
+        (tensor([[2, 1]]), tensor([[True, True]]))
+    """
+
+    def __init__(
+        self,
+        metric: Metric = "cosine",
+        dims: list[int] | None = None,
+        k: int = 500,
+        threshold: float = 0.8,
+        normalize: bool = False,
+        backend: Literal["auto", "scan", "tree"] = "auto",
+        key: str | tuple[str, ...] = "observation",
+    ):
+        super().__init__()
+        if metric not in ("cosine", "euclidean"):
+            raise ValueError(f"metric is {metric!r}; expected 'cosine' or 'euclidean'.")
+        if backend not in ("auto", "scan", "tree"):
+            raise ValueError(f"backend is {backend!r}; expected 'auto', 'scan' or 'tree'.")
+        if k < 1:
+            raise ValueError(f"k is {k}; at least one neighbour is needed.")
+        if not 0.0 <= threshold <= 1.0:
+            raise ValueError(f"threshold is {threshold}; a similarity threshold lies in [0, 1].")
+        self.metric, self.k, self.threshold = metric, int(k), float(threshold)
+        self.dims = None if dims is None else [int(dim) for dim in dims]
+        self.normalize, self.backend, self.key = normalize, backend, key
+        self._revision: tuple | None = None
+        self._index: ScanIndex | TreeIndex | None = None
+        self._scale: tuple[Tensor, Tensor] | None = None
+
+    @property
+    def config(self) -> dict[str, Any]:
+        """The constructor's arguments."""
+        names = ("metric", "dims", "k", "threshold", "normalize", "backend", "key")
+        return {name: getattr(self, name) for name in names}
+
+    # training batches
+
+    def sample(self, storage: Any, batch_size: int) -> tuple[Tensor, dict]:
+        """Draws rows uniformly, with replacement."""
+        if len(storage) == 0:
+            raise RuntimeError("the database is empty: extend it with episodes before sampling.")
+        return torch.randint(len(storage), (batch_size,), generator=self._rng), {}
+
+    # queries
+
+    def search(self, storage: Any, query: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
+        """The neighbours of each query, most similar first, ties by the lower row.
+
+        Args:
+            storage (Storage): where the rows are.
+            query (Tensor): [*B, S] in raw units; a query with NaN or Inf has no neighbour.
+
+        Returns:
+            Rows, int64 [*B, k], -1 where there is none, and ``{"similarity", "valid"}``: float32 and bool [*B, k].
+            The similarity of the nearest rows is given also where it lies below the threshold.
+
+        Raises:
+            ValueError: the query has another width than the rows.
+        """
+        shape, device = query.shape[:-1], query.device
+        index, near = self.nearest(storage, query.reshape(-1, query.shape[-1]))
+        valid = near >= self.threshold
+        index = torch.where(valid, index, -1)
+        missing = self.k - index.shape[-1]
+        if missing:  # fewer rows than k: the shape stays
+            pad = (0, missing)
+            index = torch.nn.functional.pad(index, pad, value=-1)
+            near = torch.nn.functional.pad(near, pad, value=-torch.inf)
+            valid = torch.nn.functional.pad(valid, pad, value=False)
+        info = {"similarity": near.float(), "valid": valid}
+        shape = (*shape, self.k)
+        return index.reshape(shape).to(device), {k: v.reshape(shape).to(device) for k, v in info.items()}
+
+    def nearest(self, storage: Any, query: Tensor) -> tuple[Tensor, Tensor]:
+        """The nearest rows of queries [Q, S], whatever the threshold.
+
+        Returns:
+            Rows, int64 [Q, min(k, N)], and similarities, float64; -1 and -inf for a query with NaN or Inf.
+        """
+        count = len(storage)
+        if count == 0:
+            return torch.full((len(query), 0), -1), torch.empty(len(query), 0, dtype=torch.float64)
+        index = self._build(storage)
+        query = self._prepare(query.detach().to(index.rows.device))
+        if query.shape[-1] != index.rows.shape[-1]:
+            raise ValueError(
+                f"the query compares {query.shape[-1]} entries, the database {index.rows.shape[-1]}; "
+                "pass states of the width that the database was filled with."
+            )
+        finite = query.isfinite().all(-1, keepdim=True)
+        near, rows = index.search(torch.where(finite, query, 0.0), min(self.k, count))
+        return torch.where(finite, rows, -1), torch.where(finite, near, -torch.inf)
+
+    def _prepare(self, states: Tensor) -> Tensor:
+        if self.dims is not None:
+            if max(self.dims) >= states.shape[-1]:
+                raise ValueError(f"dims are {self.dims}, but a state has {states.shape[-1]} entries.")
+            states = states[..., self.dims]
+        if self._scale is not None:
+            mean, deviation = self._scale
+            states = ((states.double() - mean) / deviation).to(torch.promote_types(states.dtype, torch.float32))
+        return states
+
+    def _build(self, storage: Any) -> ScanIndex | TreeIndex:
+        revision = storage_revision(storage)
+        if self._index is None or self._revision != revision:
+            self._scale = None
+            rows = self._prepare(storage[:].get(self.key))
+            if self.normalize:
+                deviation = rows.double().std(0, correction=0)
+                self._scale = (rows.double().mean(0), torch.where(deviation > 0, deviation, 1.0))
+                rows = self._prepare(storage[:].get(self.key))
+            self._index = build_index(rows, self.metric, self.backend)
+            self._revision = revision
+        return self._index
+
+    def invalidate(self) -> None:
+        """Drops the search structure: needed after in-place writes on the storage's leaves, which cannot be noticed."""
+        self._index = self._revision = self._scale = None
+
+    # TorchRL's sampler contract
+
+    def _empty(self) -> None:
+        self.invalidate()
+
+    def state_dict(self) -> dict[str, Any]:
+        return self.config
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        self.__init__(**state_dict)  # type: ignore[misc]
+
+    def dumps(self, path: str | Path) -> None:
+        path = Path(path)
+        path.mkdir(parents=True, exist_ok=True)
+        (path / "sampler.json").write_text(json.dumps(self.config))
+
+    def loads(self, path: str | Path) -> None:
+        self.load_state_dict(json.loads((Path(path) / "sampler.json").read_text()))
+
+    def __getstate__(self) -> dict[str, Any]:
+        state = super().__getstate__()
+        return {**state, "_index": None, "_revision": None, "_scale": None}
+
+    def __repr__(self) -> str:
+        return f"RetrievalSampler({', '.join(f'{k}={v!r}' for k, v in self.config.items())})"
