@@ -13,17 +13,18 @@ from torch import Tensor
 
 __all__ = ["DataReport", "describe_rows", "report"]
 
-SCHEMA = {  # entry: (dtype, number of dimensions)
-    "observation": (torch.float32, 2),
-    "action": (torch.float32, 2),
-    "episode": (torch.int64, 1),
-    ("next", "observation"): (torch.float32, 2),
-    ("next", "reward"): (torch.float32, 2),
-    ("next", "terminated"): (torch.bool, 2),
-    ("next", "truncated"): (torch.bool, 2),
-    ("next", "done"): (torch.bool, 2),
+SCHEMA = {  # entry: (dtype, shape)
+    "observation": (torch.float32, "[T, S]"),
+    "action": (torch.float32, "[T, A]"),
+    "episode": (torch.int64, "[T]"),
+    ("next", "observation"): (torch.float32, "[T, S]"),
+    ("next", "reward"): (torch.float32, "[T, 1]"),
+    ("next", "terminated"): (torch.bool, "[T, 1]"),
+    ("next", "truncated"): (torch.bool, "[T, 1]"),
+    ("next", "done"): (torch.bool, "[T, 1]"),
 }
 NUMBERS = ("observation", "action", ("next", "observation"), ("next", "reward"))
+FLAGS = ("terminated", "truncated", "done")
 NEAR = 0.5  # a start state counts as covered within this distance (the goal radius of the mazes)
 SHOWN = 5  # places named in one line
 NAN = float("nan")
@@ -33,8 +34,10 @@ NAN = float("nan")
 class DataReport:
     """What :func:`report` found.
 
-    ``faults`` make training wrong; ``warnings`` are facts to know. Shares lie in [0, 1]; what was not asked for is None.
-    The three numbers of ``length`` and ``returns`` (undiscounted sums of the rewards) are minimum, mean and maximum.
+    ``faults`` make training wrong; ``warnings`` are facts to know. Shares lie in [0, 1]; what was
+    not asked for is None. The three numbers of ``length`` and ``returns`` (undiscounted sums of the
+    rewards) are minimum, mean and maximum. ``duplicate_rows`` is the share of rows that repeat an
+    earlier one (observation, action, next observation and reward).
 
     Examples:
         >>> found = DataReport(episodes=2, steps=10, faults=["no end"])
@@ -96,20 +99,23 @@ def report(
 ) -> DataReport:
     """Examines recorded data before anything is trained on it.
 
-    Faults are NaN/Inf, flags that contradict each other (``done`` against ``terminated | truncated``, inside an
-    episode, missing at its end), an episode whose rows do not lie together, a next observation that is not the
-    observation of the next row, episodes recorded twice, an entry of another dtype or shape, observations or actions
-    that never change, and an expert rule that keeps nothing. Each is named with the episode and the step where it lies.
-    Single constant features, actions outside [-1, 1], rewards that are all 0 and starts far from the data are warnings.
+    Faults are NaN/Inf, flags that contradict each other (``done`` against ``terminated |
+    truncated``, inside an episode, missing at its end), an episode whose rows do not lie together,
+    a next observation that is not the observation of the next row, episodes recorded twice, an
+    entry of another dtype or shape, observations or actions that never change, and an expert rule
+    that keeps nothing. Each is named with the episode and the step where it lies. Single constant
+    features, actions outside [-1, 1], rewards that are all 0 and starts far from the data are
+    warnings.
 
     Args:
-        td (TensorDict): [T], one row a step: ``observation`` [T, S], ``action`` [T, A] float32, ``episode`` [T] int64,
-            ``("next", "observation")`` [T, S] and ``("next", "reward")`` [T, 1] float32, ``("next", "terminated")``,
-            ``("next", "truncated")`` and ``("next", "done")`` [T, 1] bool.
-        expert (callable, optional): one episode (TensorDict [L]) -> bool, whether it is a demonstration; or a rule with
-            ``select``, which sees all episodes at once.
-        starts (Tensor, optional): [M, S'] start states of the evaluation, S' <= S. One is covered if a recorded state
-            lies within 0.5 of it in the first S' dimensions.
+        td (TensorDict): [T], one row a step: ``observation`` [T, S], ``action`` [T, A] float32,
+            ``episode`` [T] int64, ``("next", "observation")`` [T, S] and ``("next", "reward")``
+            [T, 1] float32, ``("next", "terminated")``, ``("next", "truncated")`` and
+            ``("next", "done")`` [T, 1] bool.
+        expert (callable, optional): one episode (TensorDict [L]) -> bool, whether it is a
+            demonstration; or a rule with ``select``, which sees all episodes at once.
+        starts (Tensor, optional): [M, S'] start states of the evaluation, S' <= S. One is covered
+            if a recorded state lies within 0.5 of it in the first S' dimensions.
 
     Raises:
         KeyError: an entry of the table is missing.
@@ -119,7 +125,8 @@ def report(
         >>> from tensordict import TensorDict
         >>> end = torch.tensor([[False], [True]])
         >>> steps = TensorDict({
-        ...     "observation": torch.tensor([[0.0], [1.0]]), "action": torch.tensor([[0.5], [-0.5]]),
+        ...     "observation": torch.tensor([[0.0], [1.0]]),
+        ...     "action": torch.tensor([[0.5], [-0.5]]),
         ...     "episode": torch.tensor([3, 3]),
         ...     "next": {"observation": torch.tensor([[7.0], [2.0]]), "reward": torch.ones(2, 1),
         ...              "terminated": torch.zeros_like(end), "truncated": end, "done": end}}, [2])
@@ -140,7 +147,7 @@ def report(
     ids, segment, lengths = _segments(td["episode"])
     duplicates, duplicate_rows, repeats = _repeated(td, ids, segment, lengths)
     found = DataReport(
-        episodes=len(ids),
+        episodes=len(torch.unique(ids)),
         steps=len(td),
         length=_three(lengths.double()),
         returns=_three(_returns(td, segment, len(lengths))),
@@ -174,7 +181,8 @@ def describe_rows(episode: Tensor, rows: Tensor) -> str:
     first = lengths.cumsum(0) - lengths
     at = rows.nonzero().squeeze(-1)
     places = [
-        f"episode {episode[row].item()} step {(row - first[segment[row]]).item()}" for row in at[:SHOWN]
+        f"episode {episode[row].item()} step {(row - first[segment[row]]).item()}"
+        for row in at[:SHOWN]
     ]
     return f"{len(at)} row{'s' * (len(at) != 1)}: {_listed(places, len(at))}"
 
@@ -217,23 +225,20 @@ def _flag(td: TensorDictBase, name: str) -> Tensor:
 
 def _schema(td: TensorDictBase) -> list[str]:
     faults = []
-    for key, (dtype, dims) in SCHEMA.items():
+    for key, (dtype, shape) in SCHEMA.items():
         value = td[key]
         if value.dtype != dtype:
             faults.append(f"{key!r} is {value.dtype}, expected {dtype}")
-        narrow = key in (("next", "reward"), *((("next", name)) for name in _FLAGS))
-        if value.dim() != dims or (narrow and value.shape[-1] != 1):
-            expected = "[T, 1]" if narrow else "[T]" if dims == 1 else "[T, features]"
-            faults.append(f"{key!r} has shape {list(value.shape)}, expected {expected}")
-    if td["observation"].shape != td["next", "observation"].shape:
+        wide = value.dim() > 1 and value.shape[1] != 1
+        if value.dim() != shape.count(",") + 1 or (shape == "[T, 1]" and wide):
+            faults.append(f"{key!r} has shape {list(value.shape)}, expected {shape}")
+    now, following = td["observation"], td["next", "observation"]
+    if now.shape != following.shape:
         faults.append(
-            f"'observation' has shape {list(td['observation'].shape)}, "
-            f"but ('next', 'observation') has {list(td['next', 'observation'].shape)}"
+            f"'observation' has shape {list(now.shape)}, "
+            f"but ('next', 'observation') has {list(following.shape)}"
         )
     return faults
-
-
-_FLAGS = ("terminated", "truncated", "done")
 
 
 def _not_finite(td: TensorDictBase) -> list[str]:
@@ -246,7 +251,7 @@ def _not_finite(td: TensorDictBase) -> list[str]:
 
 
 def _flags(td: TensorDictBase, lengths: Tensor) -> list[str]:
-    terminated, truncated, done = (_flag(td, name) for name in _FLAGS)
+    terminated, truncated, done = (_flag(td, name) for name in FLAGS)
     last = torch.zeros_like(done)
     last[lengths.cumsum(0) - 1] = True
     ended = done | terminated | truncated
@@ -256,7 +261,9 @@ def _flags(td: TensorDictBase, lengths: Tensor) -> list[str]:
         "an episode does not end with done": last & ~ended,
     }
     return [
-        f"{name} at {describe_rows(td['episode'], rows)}" for name, rows in rules.items() if rows.any()
+        f"{name} at {describe_rows(td['episode'], rows)}"
+        for name, rows in rules.items()
+        if rows.any()
     ]
 
 
@@ -279,7 +286,8 @@ def _broken_chain(td: TensorDictBase, segment: Tensor) -> list[str]:
     now, following = now.reshape(len(td), -1), following.reshape(len(td), -1)
     differs = (following[:-1] != now[1:]).any(-1) & (segment[:-1] == segment[1:])
     at = differs.nonzero().squeeze(-1)  # few: the tolerance is looked at only there
-    close = torch.isclose(following[at], now[at + 1], rtol=1e-5, atol=1e-6, equal_nan=True).all(-1)
+    later, next_row = following[at].double(), now[at + 1].double()
+    close = torch.isclose(later, next_row, rtol=1e-5, atol=1e-6, equal_nan=True).all(-1)
     broken = torch.zeros(len(td), dtype=torch.bool)
     broken[at[~close]] = True
     if not broken.any():
@@ -289,14 +297,14 @@ def _broken_chain(td: TensorDictBase, segment: Tensor) -> list[str]:
 
 
 def _mix(value: Tensor) -> Tensor:
-    """Scrambles int64 (the finaliser of splitmix64), so that sums and chains of them hardly ever collide."""
+    """Scrambles int64 (as splitmix64 ends), so that sums and chains of them hardly ever collide."""
     value = (value ^ (value >> 30)) * -4658895280553007687
     value = (value ^ (value >> 27)) * -7723592293110705685
     return value ^ (value >> 31)
 
 
 def _row_hash(td: TensorDictBase) -> Tensor:
-    """64 bits of each row's content: int64 [T]. Sorting these is far cheaper than sorting whole rows."""
+    """64 bits of each row's content: int64 [T]. Sorting these is far cheaper than sorting rows."""
     code = torch.zeros(len(td), dtype=torch.int64)
     for key in NUMBERS:
         # adding 0 makes -0.0 and 0.0 one content
@@ -313,15 +321,17 @@ def _repeated(
     code = _row_hash(td)
     share = 1.0 - len(torch.unique(code)) / len(code)
     step = torch.arange(len(code)) - (lengths.cumsum(0) - lengths)[segment]
-    whole = torch.zeros(len(ids), dtype=torch.int64).index_add_(0, segment, _mix(code + _mix(step + 1)))
+    whole = torch.zeros(len(ids), dtype=torch.int64).index_add_(
+        0, segment, _mix(code + _mix(step + 1))
+    )
     order = torch.argsort(whole, stable=True)  # stable: the first of equal episodes comes first
     same = whole[order[1:]] == whole[order[:-1]]
-    same &= lengths[order[1:]] == lengths[order[:-1]]
     pairs = sorted(zip(order[1:][same].tolist(), order[:-1][same].tolist(), strict=True))
     if not pairs:
         return 0, share, []
     places = [
-        f"episode {ids[late].item()} repeats episode {ids[early].item()} from step 0 on ({lengths[late].item()} steps)"
+        f"episode {ids[late].item()} repeats episode {ids[early].item()} "
+        f"from step 0 on ({lengths[late].item()} steps)"
         for late, early in pairs[:SHOWN]
     ]
     return len(pairs), share, [f"episodes with identical content: {_listed(places, len(pairs))}"]
@@ -343,7 +353,7 @@ def _constants(td: TensorDictBase, found: DataReport) -> None:
 
 def _examine_rewards_and_actions(td: TensorDictBase, found: DataReport) -> None:
     if not td["next", "reward"].any():
-        found.warnings.append("every reward is 0: label the data with a goal before it is retrieved from")
+        found.warnings.append("every reward is 0: label the data before retrieving from it")
     outside = _outside(td)
     if outside.any():
         found.warnings.append(f"actions outside [-1, 1] at {describe_rows(td['episode'], outside)}")
@@ -359,7 +369,8 @@ def _examine_experts(td: TensorDictBase, lengths: Tensor, expert, found: DataRep
         kept = sum(bool(expert(episode)) for episode in episodes)
     found.expert_share = kept / len(episodes)
     if kept == 0:
-        found.faults.append(f"the expert rule {expert!r} keeps none of {len(episodes)} episodes")
+        name = getattr(expert, "__name__", expert)
+        found.faults.append(f"the expert rule {name} keeps none of {len(episodes)} episodes")
 
 
 def _examine_starts(td: TensorDictBase, starts: Tensor | None, found: DataReport) -> None:
@@ -375,7 +386,7 @@ def _examine_starts(td: TensorDictBase, starts: Tensor | None, found: DataReport
         raise ValueError("starts holds NaN or Inf; pass finite start states.")
     states = states[:, : starts.shape[-1]]
     states = states[states.isfinite().all(-1)].double().numpy()
-    # Splitting at the middle instead of the median: three times faster to build, and safe where many states are equal.
+    # Split at the middle, not the median: faster to build, and safe where many states are equal.
     tree = cKDTree(states, balanced_tree=False, compact_nodes=False)
     bound = np.nextafter(NEAR, 1.0)  # scipy's bound is exclusive
     distance, _ = tree.query(starts.double().cpu().numpy(), distance_upper_bound=bound)
