@@ -21,44 +21,54 @@ OUT_KEYS = ("target", "found", "similarity", "target_return", "target_index")
 
 
 class RetrievalTargetModule(TensorDictModuleBase):
-    r"""Chooses a close, rewarding and long-lasting demonstration state for each state (RAD, section "Target Selection").
+    r"""Chooses a close, rewarding and long-lasting demonstration state for each state.
 
-    For one state: its neighbours :math:`C_s` are the rows that :class:`~torchrl_rad.retrieval.RetrievalSampler` finds.
+    RAD's "Target Selection". For one state: its neighbours :math:`C_s` are the rows that
+    :class:`~torchrl_rad.retrieval.RetrievalSampler` finds.
 
-    - ``rule="highest"``, the paper's: candidates are the rows ``i + min_offset`` to ``i + horizon - 1`` of each
-      neighbour's own episode (cut at its end); of those whose return is at most ``tolerance`` below the best, the one with
-      the most steps left, then the larger return, then the lower row.
-    - ``rule="followed"``: the neighbour with the largest return of its own is followed; the target is the row with the
-      largest return among it and the next ``ahead`` rows of its episode (ties: more steps left).
+    - ``rule="highest"``, the paper's: candidates are the rows ``i + min_offset`` to
+      ``i + horizon - 1`` of each neighbour's own episode (cut at its end); of those whose return
+      is at most ``tolerance`` below the best, the one with the most steps left, then the larger
+      return, then the lower row.
+    - ``rule="followed"``: the neighbour with the largest return of its own is followed; the target
+      is the row with the largest return among it and the next ``ahead`` rows of its episode (ties:
+      more steps left).
 
-    Rows of a batch are independent of each other. The database is neither a parameter nor a buffer: no weight
-    synchronisation moves it, ``deepcopy`` shares it.
+    Rows of a batch are independent of each other. The database is neither a parameter nor a buffer:
+    no weight synchronisation moves it, ``deepcopy`` shares it.
 
-    ==================  ===============================  =====================================================================
-    key                 shape, dtype                     meaning
-    ==================  ===============================  =====================================================================
-    ``observation``     [*B, S], read                    state, raw units
-    ``target``          [*B, S] of its dtype             recorded state, raw units; the observation itself if none was found
-    ``found``           [*B, 1] bool                     False: no neighbour, NaN or Inf in the state, empty database
-    ``similarity``      [*B, 1] float32                  of the neighbour through which the target was reached; the best there
-                                                         was if none was found (-inf if there is none)
-    ``target_return``   [*B, 1] float32                  return from the target on; 0 if none was found
-    ``target_index``    [*B, 1] int64                    row of the database; -1 if none was found
-    ``target_offset``   [*B, 1] int64, on demand         recorded steps from that neighbour to the target; 0 if none
-    ==================  ===============================  =====================================================================
+    ==================  ========================  ==================================================
+    key                 shape, dtype              meaning
+    ==================  ========================  ==================================================
+    ``observation``     [*B, S], read             state, raw units
+    ``target``          [*B, S] of its dtype      recorded state, raw units; the observation itself
+                                                  if none was found
+    ``found``           [*B, 1] bool              False: no neighbour, NaN or Inf in the state,
+                                                  empty database
+    ``similarity``      [*B, 1] float32           of the neighbour through which the target was
+                                                  reached; the best there was if none was found
+                                                  (-inf if there is none)
+    ``target_return``   [*B, 1] float32           return from the target on; 0 if none was found
+    ``target_index``    [*B, 1] int64             row of the database; -1 if none was found
+    ``target_offset``   [*B, 1] int64, on demand  recorded steps from that neighbour to the target;
+                                                  0 if none
+    ==================  ========================  ==================================================
 
     Args:
         database (ExpertDatabase): the demonstrations.
-        horizon (int, optional): H of the planner; a target is at most H - 1 recorded steps ahead. Defaults to ``129``.
+        horizon (int, optional): H of the planner; a target is at most H - 1 recorded steps ahead.
+            Defaults to ``129``.
         rule (str, optional): ``"highest"`` or ``"followed"``. Defaults to ``"highest"``.
         tolerance (float, optional): in units of return (the paper's eta). Defaults to ``0.0``.
         ahead (int, optional): steps looked ahead by ``"followed"``. Defaults to ``16``.
-        retrieval_interval (int, optional): policy steps for which a row keeps its target; renewed where ``is_init`` is
-            True. What is kept lies in the tensordict (``("retrieval", "kept")``), see :meth:`make_tensordict_primer`.
-            Defaults to ``1``.
-        min_offset (int, optional): smallest step ahead by ``"highest"``, as far as the episode goes. Defaults to ``0``.
+        retrieval_interval (int, optional): policy steps for which a row keeps its target; renewed
+            where ``is_init`` is True. What is kept lies in the tensordict
+            (``("retrieval", "kept")``), see :meth:`make_tensordict_primer`. Defaults to ``1``.
+        min_offset (int, optional): smallest step ahead by ``"highest"``, as far as the episode
+            goes. Defaults to ``0``.
         in_keys (sequence of NestedKey, optional): the state. Defaults to ``["observation"]``.
-        out_keys (sequence of NestedKey, optional): new names, in the order of the table; a sixth one asks for the offset.
+        out_keys (sequence of NestedKey, optional): new names, in the order of the table; a sixth
+            one asks for the offset.
 
     Raises:
         ValueError: an argument has a value that it cannot have.
@@ -67,10 +77,14 @@ class RetrievalTargetModule(TensorDictModuleBase):
         >>> from tensordict import TensorDict
         >>> from torchrl.data import LazyTensorStorage
         >>> from torchrl_rad import RetrievalSampler
-        >>> database = ExpertDatabase(LazyTensorStorage(10), gamma=0.5, sampler=RetrievalSampler("euclidean", k=1))
-        >>> episode = TensorDict({"observation": torch.tensor([[0.0], [1.0], [2.0]]), "next": {
-        ...     "reward": torch.tensor([[0.0], [0.0], [1.0]]), "done": torch.tensor([[False], [False], [True]])}}, [3])
-        >>> _ = database.extend(episode)
+        >>> sampler = RetrievalSampler("euclidean", k=1)
+        >>> database = ExpertDatabase(LazyTensorStorage(10), gamma=0.5, sampler=sampler)
+        >>> end = {
+        ...     "reward": torch.tensor([[0.0], [0.0], [1.0]]),
+        ...     "done": torch.tensor([[False], [False], [True]]),
+        ... }
+        >>> state = torch.tensor([[0.0], [1.0], [2.0]])
+        >>> _ = database.extend(TensorDict({"observation": state, "next": end}, [3]))
         >>> select = RetrievalTargetModule(database, horizon=3)
         >>> out = select(TensorDict({"observation": torch.tensor([[0.1], [9.0]])}, [2]))
         >>> out["target"].squeeze(-1).tolist(), out["found"].squeeze(-1).tolist()
@@ -93,18 +107,25 @@ class RetrievalTargetModule(TensorDictModuleBase):
         if rule not in ("highest", "followed"):
             raise ValueError(f"rule is {rule!r}; expected 'highest' or 'followed'.")
         if horizon < 2:
-            raise ValueError(f"horizon is {horizon}; a target lies at least one step ahead: use 2 or more.")
+            raise ValueError(
+                f"horizon is {horizon}; a target lies at least one step ahead: use 2 or more."
+            )
         if tolerance < 0:
             raise ValueError(f"tolerance is {tolerance}; it must not be negative.")
         if rule == "followed" and not 0 <= ahead < horizon:
             raise ValueError(f"ahead is {ahead}; expected 0 to horizon - 1 = {horizon - 1}.")
         if not 0 <= min_offset < horizon:
-            raise ValueError(f"min_offset is {min_offset}; expected 0 to horizon - 1 = {horizon - 1}.")
+            raise ValueError(
+                f"min_offset is {min_offset}; expected 0 to horizon - 1 = {horizon - 1}."
+            )
         if retrieval_interval < 1:
             raise ValueError(f"retrieval_interval is {retrieval_interval}; expected 1 or more.")
         if len(in_keys) != 1 or len(out_keys) not in (5, 6):
-            raise ValueError(f"expected one in_key and five or six out_keys, got {in_keys} and {out_keys}.")
-        self.__dict__["database"] = database  # a handle, out of reach of parameters, buffers and state_dict
+            raise ValueError(
+                f"expected one in_key and five or six out_keys, got {in_keys} and {out_keys}."
+            )
+        # a handle, out of reach of parameters, buffers and state_dict
+        self.__dict__["database"] = database
         self.horizon, self.rule, self.tolerance, self.ahead = horizon, rule, tolerance, ahead
         self.retrieval_interval, self.min_offset = retrieval_interval, min_offset
         self.in_keys, self.out_keys = list(in_keys), list(out_keys)
@@ -118,7 +139,9 @@ class RetrievalTargetModule(TensorDictModuleBase):
         """Writes the target of each row into ``tensordict`` and returns it."""
         state = tensordict.get(self.in_keys[0])
         if state is None:
-            raise KeyError(f"{self.in_keys[0]!r} is missing in the tensordict; RetrievalTargetModule reads it.")
+            raise KeyError(
+                f"{self.in_keys[0]!r} is missing in the tensordict; RetrievalTargetModule reads it."
+            )
         shape = state.shape[:-1]
         query = state.reshape(-1, state.shape[-1])
         if self.retrieval_interval > 1:
@@ -136,11 +159,12 @@ class RetrievalTargetModule(TensorDictModuleBase):
             place = row.to(self.database.device)
             target = table[self.database.sampler.key][place].to(query)
             value = table["return_to_go"][place].to(device)
-        target = torch.where(hit[:, None], target, torch.nan_to_num(query, nan=0.0, posinf=0.0, neginf=0.0))
+        finite = torch.nan_to_num(query, nan=0.0, posinf=0.0, neginf=0.0)
+        target = torch.where(hit[:, None], target, finite)
         value = torch.where(hit, value, 0.0)
-        results = (target, hit[:, None], similarity[:, None], value[:, None], index[:, None], offset[:, None])
+        results = (target, hit, similarity, value, index, offset)
         for key, result in zip(self.named_out, results, strict=False):
-            tensordict.set(key, result.reshape(*shape, result.shape[-1]))
+            tensordict.set(key, result.reshape(*shape, -1))
         return tensordict
 
     # the rule
@@ -152,17 +176,18 @@ class RetrievalTargetModule(TensorDictModuleBase):
             query (Tensor): [Q, S], raw units.
 
         Returns:
-            Row of the target (int64 [Q], -1 if none), similarity (float32 [Q]) and recorded offset (int64 [Q]).
+            Row of the target (int64 [Q], -1 if none), similarity (float32 [Q]) and recorded offset
+            (int64 [Q]).
         """
         database = self.database
         near, similar = database.sampler.nearest(database.storage, query)  # [Q, k]
         if near.shape[-1] == 0:
             none = torch.full((len(query),), -1, device=query.device)
-            return none, torch.full((len(query),), -torch.inf, device=query.device), torch.zeros_like(none)
+            return none, torch.full_like(none, -torch.inf, dtype=torch.float32), none * 0
         valid = (similar >= database.sampler.threshold) & (near >= 0)
         rows = near.clamp_min(0)
         choose = self._highest if self.rule == "highest" else self._followed
-        target, anchor = choose(rows, valid)  # row of the target [Q], place of its neighbour in C_s [Q]
+        target, anchor = choose(rows, valid)  # row [Q], place of its neighbour in C_s [Q]
         hit = valid.any(-1)
         anchor = torch.where(hit, anchor, 0)[:, None]
         similarity = similar.gather(-1, anchor).squeeze(-1).float()
@@ -186,7 +211,7 @@ class RetrievalTargetModule(TensorDictModuleBase):
         value = torch.where(fits, table.values[first], -torch.inf)
         fits &= value == value.amax(-1, keepdim=True)
         target = torch.where(fits, first, torch.iinfo(torch.int64).max).amin(-1)
-        # neighbours are ordered by similarity: the first that reaches the target is the most similar one
+        # neighbours are ordered: the first that reaches the target is the most similar one
         reaches = valid & (low <= target[:, None]) & (target[:, None] <= high)
         return target, reaches.int().argmax(-1)
 
@@ -202,8 +227,10 @@ class RetrievalTargetModule(TensorDictModuleBase):
     # keeping a target for several steps
 
     def _kept(self, tensordict: TensorDictBase, query: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        kept = tensordict.get(("retrieval", "kept")).reshape(-1, 4)  # index, similarity, offset, age
-        fresh = tensordict.get("is_init").reshape(-1) | (kept[:, 3] >= self.retrieval_interval) | (kept[:, 3] == 0)
+        kept = tensordict.get(("retrieval", "kept")).reshape(-1, 4)
+        age = kept[:, 3]  # before it index, similarity, offset
+        fresh = tensordict.get("is_init").reshape(-1)
+        fresh = fresh | (age >= self.retrieval_interval) | (age == 0)
         # a kept target comes one recorded step nearer with each step
         state = kept + kept.new_tensor([0.0, 0.0, -1.0, 1.0])
         if fresh.any():
@@ -213,9 +240,13 @@ class RetrievalTargetModule(TensorDictModuleBase):
         return state[:, 0].long(), state[:, 1].float(), state[:, 2].long()
 
     def make_tensordict_primer(self) -> TensorDictPrimer:
-        """The environment transform that carries what is kept (``retrieval_interval`` > 1) from step to step."""
+        """The environment transform that carries what is kept from step to step.
+
+        Needed where ``retrieval_interval`` is larger than 1.
+        """
         spec = Unbounded((4,), dtype=torch.float64)
         return TensorDictPrimer({("retrieval", "kept"): spec}, default_value=0.0, expand_specs=True)
 
     def extra_repr(self) -> str:
-        return f"rule={self.rule!r}, horizon={self.horizon}, tolerance={self.tolerance}, ahead={self.ahead}"
+        names = ("rule", "horizon", "tolerance", "ahead", "min_offset", "retrieval_interval")
+        return ", ".join(f"{name}={getattr(self, name)!r}" for name in names)

@@ -16,25 +16,33 @@ __all__ = ["RetrievalSampler", "storage_revision"]
 
 
 def storage_revision(storage: Any) -> tuple[int, int, int | None]:
-    """What a cache made from a storage must be keyed on; in-place writes on leaves do not show in it."""
+    """What a cache made from a storage must be keyed on.
+
+    In-place writes on leaves do not show in it.
+    """
     return id(storage), len(storage), getattr(storage, "_mutation_revision", None)
 
 
 class RetrievalSampler(Sampler):
     """Finds the rows of a storage that are most similar to a query (TS of RAD, first step).
 
-    :meth:`sample` draws rows uniformly, as any training batch wants them; :meth:`search` answers queries. The search
-    structure is built at the first query, again when the storage changed (see :meth:`invalidate`), and is never pickled.
+    :meth:`sample` draws rows uniformly, as any training batch wants them; :meth:`search` answers
+    queries. The search structure is built at the first query, again when the storage changed (see
+    :meth:`invalidate`), and is never pickled.
 
     Args:
-        metric (str, optional): ``"cosine"`` or ``"euclidean"`` (similarity 1 / (1 + d)). Defaults to ``"cosine"``.
+        metric (str, optional): ``"cosine"`` or ``"euclidean"`` (similarity 1 / (1 + d)).
+            Defaults to ``"cosine"``.
         dims (sequence of int, optional): entries of the state that are compared. Defaults to all.
         k (int, optional): number of neighbours. Defaults to ``500``.
-        threshold (float, optional): a neighbour is at least this similar; in [0, 1]. Defaults to ``0.8``.
-        normalize (bool, optional): compare states standardised by the mean and deviation of the storage.
-            Defaults to ``False``.
-        backend (str, optional): ``"auto"``, ``"scan"`` or ``"tree"``; all are exact. Defaults to ``"auto"``.
-        key (NestedKey, optional): entry of the storage that is searched. Defaults to ``"observation"``.
+        threshold (float, optional): a neighbour is at least this similar; in [0, 1].
+            Defaults to ``0.8``.
+        normalize (bool, optional): compare states standardised by the mean and deviation of the
+            storage. Defaults to ``False``.
+        backend (str, optional): ``"auto"``, ``"scan"`` or ``"tree"``; all are exact.
+            Defaults to ``"auto"``.
+        key (NestedKey, optional): entry of the storage that is searched.
+            Defaults to ``"observation"``.
 
     Raises:
         ValueError: an argument has a value that it cannot have.
@@ -43,7 +51,8 @@ class RetrievalSampler(Sampler):
         >>> from tensordict import TensorDict
         >>> from torchrl.data import LazyTensorStorage
         >>> storage = LazyTensorStorage(4)
-        >>> storage.set(range(3), TensorDict({"observation": torch.tensor([[0.0], [1.0], [2.0]])}, [3]))
+        >>> rows = TensorDict({"observation": torch.tensor([[0.0], [1.0], [2.0]])}, [3])
+        >>> storage.set(range(3), rows)
         >>> sampler = RetrievalSampler(metric="euclidean", k=2, threshold=0.5)
         >>> index, info = sampler.search(storage, torch.tensor([[1.8]]))
         >>> index, info["valid"]
@@ -100,13 +109,14 @@ class RetrievalSampler(Sampler):
             query (Tensor): [*B, S] in raw units; a query with NaN or Inf has no neighbour.
 
         Returns:
-            Rows, int64 [*B, k], -1 where there is none, and ``{"similarity", "valid"}``: float32 and bool [*B, k].
-            The similarity of the nearest rows is given also where it lies below the threshold.
+            Rows, int64 [*B, k], -1 where there is none, and ``{"similarity", "valid"}``: float32
+            and bool [*B, k]. The similarity of the nearest rows is given also where it lies below the
+            threshold.
 
         Raises:
             ValueError: the query has another width than the rows.
         """
-        shape, device = query.shape[:-1], query.device
+        shape, device = (*query.shape[:-1], self.k), query.device
         index, near = self.nearest(storage, query.reshape(-1, query.shape[-1]))
         valid = near >= self.threshold
         index = torch.where(valid, index, -1)
@@ -117,24 +127,26 @@ class RetrievalSampler(Sampler):
             near = torch.nn.functional.pad(near, pad, value=-torch.inf)
             valid = torch.nn.functional.pad(valid, pad, value=False)
         info = {"similarity": near.float(), "valid": valid}
-        shape = (*shape, self.k)
-        return index.reshape(shape).to(device), {k: v.reshape(shape).to(device) for k, v in info.items()}
+        info = {name: value.reshape(shape).to(device) for name, value in info.items()}
+        return index.reshape(shape).to(device), info
 
     def nearest(self, storage: Any, query: Tensor) -> tuple[Tensor, Tensor]:
         """The nearest rows of queries [Q, S], whatever the threshold.
 
         Returns:
-            Rows, int64 [Q, min(k, N)], and similarities, float64; -1 and -inf for a query with NaN or Inf.
+            Rows, int64 [Q, min(k, N)], and similarities, float64; -1 and -inf for a query with NaN
+            or Inf.
         """
         count = len(storage)
         if count == 0:
-            return torch.full((len(query), 0), -1), torch.empty(len(query), 0, dtype=torch.float64)
+            rows = torch.full((len(query), 0), -1)
+            return rows, torch.empty(len(query), 0, dtype=torch.float64)
         index = self._build(storage)
         query = self._prepare(query.detach().to(index.rows.device))
         if query.shape[-1] != index.rows.shape[-1]:
             raise ValueError(
-                f"the query compares {query.shape[-1]} entries, the database {index.rows.shape[-1]}; "
-                "pass states of the width that the database was filled with."
+                f"the query compares {query.shape[-1]} entries, the database "
+                f"{index.rows.shape[-1]}; pass states as wide as those it was filled with."
             )
         finite = query.isfinite().all(-1, keepdim=True)
         near, rows = index.search(torch.where(finite, query, 0.0), min(self.k, count))
@@ -143,11 +155,13 @@ class RetrievalSampler(Sampler):
     def _prepare(self, states: Tensor) -> Tensor:
         if self.dims is not None:
             if max(self.dims) >= states.shape[-1]:
-                raise ValueError(f"dims are {self.dims}, but a state has {states.shape[-1]} entries.")
+                width = states.shape[-1]
+                raise ValueError(f"dims are {self.dims}, but a state has {width} entries.")
             states = states[..., self.dims]
         if self._scale is not None:
             mean, deviation = self._scale
-            states = ((states.double() - mean) / deviation).to(torch.promote_types(states.dtype, torch.float32))
+            dtype = torch.promote_types(states.dtype, torch.float32)
+            states = ((states.double() - mean) / deviation).to(dtype)
         return states
 
     def _build(self, storage: Any) -> ScanIndex | TreeIndex:
@@ -164,7 +178,10 @@ class RetrievalSampler(Sampler):
         return self._index
 
     def invalidate(self) -> None:
-        """Drops the search structure: needed after in-place writes on the storage's leaves, which cannot be noticed."""
+        """Drops the search structure.
+
+        Needed after in-place writes on the storage's leaves, which cannot be noticed.
+        """
         self._index = self._revision = self._scale = None
 
     # TorchRL's sampler contract

@@ -20,7 +20,8 @@ TREE_DIMS = 3  # beyond, a scan of k in the hundreds is faster
 def similarity(query: Tensor, rows: Tensor, metric: Metric) -> Tensor:
     r"""Similarity of states, in float64 and the same to the last bit for every batching.
 
-    ``cosine`` is :math:`x \cdot s / (|x||s|)`, -inf where a vector is zero; ``euclidean`` is :math:`1 / (1 + |x - s|)`.
+    ``cosine`` is :math:`x \cdot s / (|x||s|)`, -inf where a vector is zero; ``euclidean`` is
+    :math:`1 / (1 + |x - s|)`.
 
     Args:
         query (Tensor): [..., D], broadcast against ``rows``.
@@ -45,7 +46,8 @@ def similarity(query: Tensor, rows: Tensor, metric: Metric) -> Tensor:
 
 
 def _sum_last(values: Tensor) -> Tensor:
-    # one dim after the other: torch.sum orders its additions by the shape, so that a batch could differ from one row
+    # one dim after the other: torch.sum orders its additions by the shape, so that a batch could
+    # differ from one row
     total = values[..., 0]
     for dim in range(1, values.shape[-1]):
         total = total + values[..., dim]
@@ -83,7 +85,8 @@ class ScanIndex:
             k (int): at most the number of rows.
 
         Returns:
-            Similarities, float64 [Q, k], falling, and row numbers, int64 [Q, k]; ties by the lower row.
+            Similarities, float64 [Q, k], falling, and row numbers, int64 [Q, k]; ties by the lower
+            row.
         """
         count = len(self.rows)
         chunk = max(k, SCAN_ENTRIES // max(1, len(query) * self.rows.shape[-1]))
@@ -113,7 +116,9 @@ def _leading(near: Tensor, k: int) -> tuple[Tensor, Tensor]:
 
 
 class TreeIndex:
-    """scipy's k-d tree for a few dims, with Euclidean similarity; re-ranked so that ties fall as in a scan.
+    """scipy's k-d tree for a few dims, with Euclidean similarity.
+
+    Its answers are ranked anew, so that ties fall as in a scan.
 
     Args:
         rows (Tensor): [N, D] on the CPU.
@@ -151,15 +156,18 @@ class TreeIndex:
         results = []
         for row, candidates in zip(query, found, strict=True):
             index = torch.tensor(candidates)[None]
-            results.append(_order(similarity(row, self.rows[index[0]], "euclidean")[None], index, k))
+            near = similarity(row, self.rows[index[0]], "euclidean")[None]
+            results.append(_order(near, index, k))
         return torch.cat([r[0] for r in results]), torch.cat([r[1] for r in results])
 
 
 def build_index(rows: Tensor, metric: Metric, backend: str) -> ScanIndex | TreeIndex:
-    """The search structure for rows [N, D]: ``"scan"``, ``"tree"``, or the faster of both with ``"auto"``.
+    """The search structure for rows [N, D].
+
+    ``backend`` is ``"scan"``, ``"tree"``, or ``"auto"`` for the faster of both.
 
     Raises:
-        ValueError: a tree is asked for cosine similarity, or for rows on another device than the CPU.
+        ValueError: a tree is asked for cosine similarity, or for rows that are not on the CPU.
     """
     fits = metric == "euclidean" and rows.device.type == "cpu"
     if backend == "tree" and not fits:

@@ -11,12 +11,13 @@ __all__ = ["WindowMax"]
 class WindowMax:
     """Maxima over rows i..j of a column, and the first row there that comes close to a given value.
 
-    A sparse table: level p holds the maximum of the 2^p rows from each row on. A query reads two entries, or one a level,
-    whatever the length of the window.
+    A sparse table: level p holds the maximum of the 2^p rows from each row on. A query reads two
+    entries, or one a level, whatever the length of the window.
 
     Args:
         values (Tensor): [N].
-        longest (int, optional): rows of the longest window that will be asked for. Defaults to all.
+        longest (int, optional): rows of the longest window that will be asked for.
+            Defaults to all.
 
     Examples:
         >>> table = WindowMax(torch.tensor([1.0, 3.0, 2.0, 3.0]))
@@ -38,12 +39,15 @@ class WindowMax:
         self.table = torch.stack(levels)  # [levels, N]
 
     def max(self, low: Tensor, high: Tensor) -> Tensor:
-        """Maximum over rows low..high, both included; ``low <= high``. Shapes as the arguments, int64."""
+        """Maximum over rows low..high, both included; ``low <= high``, int64 of any shape."""
         level = torch.log2((high - low + 1).double()).floor().long()
         return torch.maximum(self.table[level, low], self.table[level, high - (1 << level) + 1])
 
     def first(self, low: Tensor, high: Tensor, best: Tensor, tolerance: float) -> Tensor:
-        """First row in low..high whose value is at most ``tolerance`` below ``best``; ``high + 1`` if there is none."""
+        """First row in low..high whose value is at most ``tolerance`` below ``best``.
+
+        ``high + 1`` if there is none.
+        """
         row = low.clone()
         for level in range(len(self.table) - 1, -1, -1):
             span = 1 << level
