@@ -53,10 +53,25 @@ def plan_levels(horizon: int, jumps: Sequence[int]) -> list[Level]:
     fits = all(jump >= 1 and span % jump == 0 and span > jump for span, jump in pairwise(spans))
     if not jumps or jumps[-1] != 1 or not fits:
         raise ValueError(
-            f"jumps {list(jumps)} do not multiply out to horizon {horizon}: horizon - 1 must be a multiple of the first, "
-            "each jump one of the next, and the last must be 1, as in horizon 129 with jumps (32, 8, 1)."
+            f"jumps {list(jumps)} do not multiply out to horizon {horizon}: horizon - 1 must be a "
+            "multiple of the first, each jump one of the next, and the last must be 1, as in "
+            "horizon 129 with jumps (32, 8, 1)."
         )
     return [Level(jump, span // jump + 1) for span, jump in pairwise(spans)]
+
+
+class Pin(NamedTuple):
+    """What one level is told of the target.
+
+    Attributes:
+        token: int64 [Q], grid point.
+        state: [Q, S], the state there, raw units.
+        active: bool [Q], whether it is pinned.
+    """
+
+    token: Tensor
+    state: Tensor
+    active: Tensor
 
 
 class PlanNetworks(nn.ModuleList):
@@ -67,23 +82,28 @@ class PlanNetworks(nn.ModuleList):
 
 
 class DiffuserLitePlanner(TensorDictModuleBase):
-    """Plans states on ever finer grids and acts by inverse dynamics (DL-RAD; DiffuserLite, Dong et al., 2024).
+    """Plans states on ever finer grids and acts by inverse dynamics (DL-RAD).
 
-    Level l holds states 0, J_l, 2 J_l, ... steps ahead; only the first jump of a level is refined by the next one, whose
-    first and last states are known then. The current state and the target are in-painted: they are in ``plan`` exactly.
-    Rows with ``found`` False are planned without a target in the same batch.
+    It is DiffuserLite (Dong et al., 2024) with a retrieved target.
 
-    ================  ===========================  =========================================================================
-    key               shape, dtype                 meaning
-    ================  ===========================  =========================================================================
-    ``observation``   [*B, S], read                state, raw units; NaN and Inf count as 0
-    ``target``        [*B, S], read                target, raw units
-    ``found``         [*B, 1] bool, read           whether there is a target
-    ``target_step``   [*B, 1] int64, read          steps to the target, 1 to H - 1
-    ``target_index``  [*B, 1] int64, read          its row in the database (-1: none), read for a shifted placement
-    ``plan``          [*B, L, S] float32           planned states, raw units, at ``plan_times`` (int64 [L]) steps from now
-    ``action``        [*B, A] float32              action
-    ================  ===========================  =========================================================================
+    Level l holds states 0, J_l, 2 J_l, ... steps ahead; only the first jump of a level is refined
+    by the next one, whose first and last states are known then. The current state and the target
+    are in-painted: they are in ``plan`` exactly. Rows with ``found`` False are planned without a
+    target in the same batch.
+
+    ================  ====================  ====================================================
+    key               shape, dtype          meaning
+    ================  ====================  ====================================================
+    ``observation``   [*B, S], read         state, raw units; NaN and Inf count as 0
+    ``target``        [*B, S], read         target, raw units
+    ``found``         [*B, 1] bool, read    whether there is a target
+    ``target_step``   [*B, 1] int64, read   steps to the target, 1 to H - 1
+    ``target_index``  [*B, 1] int64, read   its row in the database (-1: none), read for a
+                                            shifted placement
+    ``plan``          [*B, L, S] float32    planned states, raw units, at ``plan_times``
+                                            (int64 [L]) steps from now
+    ``action``        [*B, A] float32       action
+    ================  ====================  ====================================================
 
     Args:
         normalizer (Normalizer): of states.
@@ -94,14 +114,17 @@ class DiffuserLitePlanner(TensorDictModuleBase):
         process (str, optional): ``"flow"`` or ``"diffusion"``. Defaults to ``"flow"``.
         steps (int, optional): calls of the network a level. Defaults to ``3``.
         temperature (float, optional): scale of the initial noise. Defaults to ``1.0``.
-        candidates (int, optional): first-level plans a row, of which the return model keeps the best. Defaults to ``1``.
+        candidates (int, optional): first-level plans a row, of which the return model keeps the
+            best. Defaults to ``1``.
         return_model (ReturnModel, optional): J; needed for more than one candidate.
-        noise (str, optional): ``"sample"``; ``"seeded"``: the same noise at each call and for each row, also used when
-            ``"sample"`` meets ``ExplorationType.DETERMINISTIC``; ``"zero"``. Defaults to ``"sample"``.
-        targets (bool, optional): False gives the backbone, which reads the observation alone. Defaults to ``True``.
+        noise (str, optional): ``"sample"``; ``"seeded"``: the same noise at each call and for each
+            row, also used when ``"sample"`` meets ``ExplorationType.DETERMINISTIC``; ``"zero"``.
+            Defaults to ``"sample"``.
+        targets (bool, optional): False gives the backbone, which reads the observation alone.
+            Defaults to ``True``.
         placement (str, optional): see :class:`TargetPlacement`. Defaults to ``"shifted"``.
-        database (ExpertDatabase, optional): where a shifted placement looks up the target's episode; without it the target
-            itself stands in.
+        database (ExpertDatabase, optional): where a shifted placement looks up the target's
+            episode; without it the target itself stands in.
         in_keys, out_keys (sequence of NestedKey, optional): new names, in the order of the table.
 
     Raises:
@@ -110,7 +133,8 @@ class DiffuserLitePlanner(TensorDictModuleBase):
     Examples:
         >>> from tensordict import TensorDict
         >>> states = Normalizer.identity(2)
-        >>> planner = DiffuserLitePlanner(states, InverseDynamics(states, states, 1), horizon=9, jumps=(4, 1), width=32)
+        >>> inverse = InverseDynamics(states, states, 1)
+        >>> planner = DiffuserLitePlanner(states, inverse, horizon=9, jumps=(4, 1), width=32)
         >>> out = planner(TensorDict({"observation": torch.zeros(3, 2), "target": torch.ones(3, 2),
         ...     "found": torch.ones(3, 1, dtype=torch.bool), "target_step": torch.full((3, 1), 4),
         ...     "target_index": torch.full((3, 1), -1)}, [3]))
@@ -145,7 +169,9 @@ class DiffuserLitePlanner(TensorDictModuleBase):
         if steps < 1:
             raise ValueError(f"steps is {steps}; a plan needs at least one inference step.")
         if candidates < 1 or (candidates > 1 and return_model is None):
-            raise ValueError(f"candidates is {candidates}: expected 1, or more and a return_model that ranks them.")
+            raise ValueError(
+                f"candidates is {candidates}: expected 1, or more and a return_model to rank them."
+            )
         if noise not in ("sample", "seeded", "zero"):
             raise ValueError(f"noise is {noise!r}; expected 'sample', 'seeded' or 'zero'.")
         if temperature < 0:
@@ -159,9 +185,12 @@ class DiffuserLitePlanner(TensorDictModuleBase):
         self.candidates, self.noise = candidates, noise
         self.placement = TargetPlacement(placement)
         self.__dict__["database"] = database  # a handle, as in RetrievalTargetModule
-        self.normalizer, self.inverse_dynamics, self.return_model = normalizer, inverse_dynamics, return_model
+        self.normalizer, self.inverse_dynamics = normalizer, inverse_dynamics
+        self.return_model = return_model
         state_dim = len(normalizer.mean)
-        self.networks = PlanNetworks(DiT(state_dim, level.tokens, width, heads, blocks) for level in self.levels)
+        self.networks = PlanNetworks(
+            DiT(state_dim, level.tokens, width, heads, blocks) for level in self.levels
+        )
         self.register_buffer("plan_times", _plan_times(self.levels), persistent=False)
 
     @dispatch
@@ -170,14 +199,15 @@ class DiffuserLitePlanner(TensorDictModuleBase):
         """Writes plan and action into ``tensordict`` and returns it."""
         observation = tensordict.get(self.in_keys[0])
         if observation is None:
-            raise KeyError(f"{self.in_keys[0]!r} is missing in the tensordict; the planner reads it.")
-        if observation.shape[-1] != len(self.normalizer.mean):
+            raise KeyError(f"{self.in_keys[0]!r} is missing in the tensordict: a planner reads it.")
+        shape, width = observation.shape[:-1], observation.shape[-1]
+        if width != len(self.normalizer.mean):
             raise ValueError(
-                f"{self.in_keys[0]!r} has {observation.shape[-1]} entries; the planner was built for "
+                f"{self.in_keys[0]!r} has {width} entries; the planner was built for "
                 f"{len(self.normalizer.mean)}."
             )
-        shape = observation.shape[:-1]
-        state = torch.nan_to_num(observation, nan=0.0, posinf=0.0, neginf=0.0).float().reshape(-1, observation.shape[-1])
+        state = torch.nan_to_num(observation, nan=0.0, posinf=0.0, neginf=0.0).float()
+        state = state.reshape(-1, width)
         pins = self._pins(tensordict, len(state)) if self.targets else [None] * len(self.levels)
         plan = self.plan(state, pins)
         action = self.inverse_dynamics(state, plan[:, 1])
@@ -187,35 +217,36 @@ class DiffuserLitePlanner(TensorDictModuleBase):
 
     # what is known
 
-    def _pins(self, tensordict: TensorDictBase, rows: int) -> list[tuple[Tensor, Tensor, Tensor] | None]:
-        """For each level the token pinned [Q], the raw state there [Q, S] and whether it is pinned [Q]."""
+    def _pins(self, tensordict: TensorDictBase, rows: int) -> list[Pin | None]:
         target, found, step = (tensordict.get(key) for key in self.in_keys[1:4])
-        target, found, step = target.reshape(rows, -1).float(), found.reshape(rows), step.reshape(rows)
+        target = target.reshape(rows, -1).float()
+        found, step = found.reshape(rows), step.reshape(rows)
         index = tensordict.get(self.in_keys[4], None) if len(self.in_keys) > 4 else None
-        pins: list[tuple[Tensor, Tensor, Tensor] | None] = []
+        pins: list[Pin | None] = []
         for number, level in enumerate(self.levels):
             place = self.placement(step, number, *level)
             state = target
             if index is not None:
                 state = self._recorded(target, index.reshape(rows), place.time - step)
-            pins.append((place.token, state, found & place.active))
+            pins.append(Pin(place.token, state, found & place.active))
         return pins
 
     def _recorded(self, target: Tensor, index: Tensor, shift: Tensor) -> Tensor:
-        """The state ``shift`` rows after row ``index``, cut to its episode; the target where there is no row."""
+        """The state ``shift`` rows after row ``index``, cut to its episode; else the target."""
         database = self.database
         if database is None or len(database) == 0:
             return target
         rows = database[:]
         place = index.clamp_min(0).to(database.device)
         shift = shift.to(database.device)
-        place = place + torch.minimum(torch.maximum(shift, -rows["step"][place]), rows["remaining"][place])
-        return torch.where(index[:, None] >= 0, rows[database.sampler.key][place].to(target), target)
+        place = place + shift.maximum(-rows["step"][place]).minimum(rows["remaining"][place])
+        recorded = rows[database.sampler.key][place].to(target)
+        return torch.where(index[:, None] >= 0, recorded, target)
 
     # the plan
 
-    def plan(self, state: Tensor, pins: Sequence[tuple[Tensor, Tensor, Tensor] | None]) -> Tensor:
-        """Plans [Q, L, S] for raw states [Q, S]; ``pins`` holds for each level (token, raw state, whether) or None."""
+    def plan(self, state: Tensor, pins: Sequence[Pin | None]) -> Tensor:
+        """Plans [Q, L, S] for raw states [Q, S]; ``pins`` holds a :class:`Pin` or None a level."""
         seeded = torch.Generator(device=state.device).manual_seed(0) if self._is_seeded() else None
         end: Tensor | None = None
         finished: list[Tensor] = []
@@ -230,7 +261,7 @@ class DiffuserLitePlanner(TensorDictModuleBase):
         number: int,
         state: Tensor,
         end: Tensor | None,
-        pin: tuple[Tensor, Tensor, Tensor] | None,
+        pin: Pin | None,
         generator: torch.Generator | None,
     ) -> Tensor:
         tokens = self.levels[number].tokens
@@ -240,9 +271,9 @@ class DiffuserLitePlanner(TensorDictModuleBase):
         if end is not None:
             known[:, -1], mask[:, -1] = end, True
         if pin is not None:
-            token, pinned, active = pin
-            here = (torch.arange(tokens, device=state.device) == token[:, None]) & active[:, None]  # [Q, n]
-            known = torch.where(here[..., None], pinned[:, None], known)
+            here = torch.arange(tokens, device=state.device) == pin.token[:, None]  # [Q, n]
+            here &= pin.active[:, None]
+            known = torch.where(here[..., None], pin.state[:, None], known)
             mask = mask | here[..., None]
         copies = self.candidates if number == 0 else 1
         many, many_mask = known.repeat_interleave(copies, 0), mask.repeat_interleave(copies, 0)
@@ -268,7 +299,9 @@ class DiffuserLitePlanner(TensorDictModuleBase):
         deterministic = exploration_type() == ExplorationType.DETERMINISTIC
         return self.noise == "seeded" or (self.noise == "sample" and deterministic)
 
-    def _noise(self, rows: int, copies: int, tokens: int, generator: torch.Generator | None, like: Tensor) -> Tensor:
+    def _noise(
+        self, rows: int, copies: int, tokens: int, generator: torch.Generator | None, like: Tensor
+    ) -> Tensor:
         shape = (rows * copies, tokens, like.shape[-1])
         if self.noise == "zero":
             return like.new_zeros(shape)

@@ -27,7 +27,9 @@ class Block(nn.Module):
         self.norm = nn.LayerNorm(width, eps=1e-6, elementwise_affine=False)
         self.qkv = nn.Linear(width, 3 * width)
         self.out = nn.Linear(width, width)
-        self.mlp = nn.Sequential(nn.Linear(width, 4 * width), nn.GELU("tanh"), nn.Linear(4 * width, width))
+        self.mlp = nn.Sequential(
+            nn.Linear(width, 4 * width), nn.GELU("tanh"), nn.Linear(4 * width, width)
+        )
         self.modulation = nn.Linear(width, 6 * width)
 
     def forward(self, x: Tensor, condition: Tensor) -> Tensor:
@@ -37,15 +39,17 @@ class Block(nn.Module):
         return x + gate_mlp * self.mlp(self.norm(x) * (1 + scale_mlp) + shift_mlp)
 
     def _attention(self, x: Tensor) -> Tensor:
-        qkv = self.qkv(x).unflatten(-1, (3, self.heads, -1)).permute(2, 0, 3, 1, 4)  # [3, B, heads, L, W / heads]
+        qkv = self.qkv(x).unflatten(-1, (3, self.heads, -1))
+        qkv = qkv.permute(2, 0, 3, 1, 4)  # [3, B, heads, L, W / heads]
         return self.out(F.scaled_dot_product_attention(*qkv).transpose(1, 2).flatten(-2))
 
 
 class DiT(nn.Module):
     """Predicts from noisy states, a mask of the known ones and the time of the process.
 
-    The residual stream is the standard one. With ``mask_channel`` the network is told which entries are known: at a random
-    place a clean state cannot be told from noise. The output is zero at initialisation.
+    The residual stream is the standard one. With ``mask_channel`` the network is told which entries
+    are known: at a random place a clean state cannot be told from noise. The output is zero at
+    initialisation.
 
     Args:
         state_dim (int): S, entries of a state.
@@ -57,14 +61,21 @@ class DiT(nn.Module):
 
     Examples:
         >>> network = DiT(state_dim=4, tokens=5)
-        >>> network(torch.randn(3, 5, 4), torch.zeros(3, 5, 1, dtype=torch.bool), torch.rand(3)).shape
+        >>> mask = torch.zeros(3, 5, 1, dtype=torch.bool)
+        >>> network(torch.randn(3, 5, 4), mask, torch.rand(3)).shape
         torch.Size([3, 5, 4])
     """
 
     positions: Tensor
 
     def __init__(
-        self, state_dim: int, tokens: int, width: int = 256, heads: int = 8, blocks: int = 2, mask_channel: bool = True
+        self,
+        state_dim: int,
+        tokens: int,
+        width: int = 256,
+        heads: int = 8,
+        blocks: int = 2,
+        mask_channel: bool = True,
     ):
         super().__init__()
         if width % heads:
@@ -72,7 +83,9 @@ class DiT(nn.Module):
         self.width, self.mask_channel = width, mask_channel
         self.register_buffer("positions", sinusoids(torch.arange(float(tokens)), width))
         self.embed = nn.Linear(state_dim + mask_channel, width)
-        self.time = nn.Sequential(nn.Linear(width, width), nn.SiLU(), nn.Linear(width, width), nn.SiLU())
+        self.time = nn.Sequential(
+            nn.Linear(width, width), nn.SiLU(), nn.Linear(width, width), nn.SiLU()
+        )
         self.blocks = nn.ModuleList(Block(width, heads) for _ in range(blocks))
         self.norm = nn.LayerNorm(width, eps=1e-6, elementwise_affine=False)
         self.modulation = nn.Linear(width, 2 * width)
@@ -84,11 +97,18 @@ class DiT(nn.Module):
             if isinstance(module, nn.Linear):
                 nn.init.xavier_uniform_(module.weight)
                 nn.init.zeros_(module.bias)
-        for layer in (*(block.modulation for block in self.blocks), self.modulation, self.head):
-            nn.init.zeros_(layer.weight)
+        for name, parameter in self.named_parameters():
+            if name.endswith(("modulation.weight", "head.weight")):
+                nn.init.zeros_(parameter)
 
     def forward(self, x: Tensor, mask: Tensor, time: Tensor) -> Tensor:
-        """Predicts [B, n, S] from states [B, n, S], mask bool [B, n, 1] and time [B], or [1] for all alike."""
+        """Predicts [B, n, S].
+
+        Args:
+            x (Tensor): noisy states [B, n, S].
+            mask (Tensor): bool [B, n, 1], True where they are known.
+            time (Tensor): of the process, [B], or [1] for all alike.
+        """
         if self.mask_channel:
             x = torch.cat([x, mask.to(x.dtype)], -1)
         x = self.embed(x) + self.positions  # [B, n, W]

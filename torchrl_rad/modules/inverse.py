@@ -15,9 +15,12 @@ __all__ = ["InverseDynamics", "inverse_dynamics_actor"]
 
 
 class InverseDynamics(nn.Module):
-    """MLP from (state, next state) to an action within bounds (f_a of RAD, section "Planning Module").
+    """MLP from (state, next state) to an action within bounds.
 
-    It sees the state and the change of state, each standardised: the change over one step is small against the state.
+    It is f_a of RAD, section "Planning Module".
+
+    It sees the state and the change of state, each standardised: the change over one step is small
+    against the state.
 
     Args:
         normalizer (Normalizer): of states.
@@ -33,7 +36,12 @@ class InverseDynamics(nn.Module):
     """
 
     def __init__(
-        self, normalizer: Normalizer, difference: Normalizer, action_dim: int, width: int = 256, bound: float = 1.0
+        self,
+        normalizer: Normalizer,
+        difference: Normalizer,
+        action_dim: int,
+        width: int = 256,
+        bound: float = 1.0,
     ):
         super().__init__()
         self.normalizer, self.difference, self.bound = normalizer, difference, bound

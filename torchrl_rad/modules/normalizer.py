@@ -35,13 +35,16 @@ class Normalizer(nn.Module):
     def of(cls, states: Tensor) -> Normalizer:
         """From recorded states [T, S]; raises ValueError if they hold NaN or Inf."""
         if not states.isfinite().all():
-            raise ValueError("states with NaN or Inf give no normaliser; see torchrl_rad.data.report for where they are.")
+            raise ValueError(
+                "states with NaN or Inf give no normaliser; torchrl_rad.data.report says where "
+                "they are."
+            )
         states = states.double()
         return cls(states.mean(0), states.std(0, correction=0))
 
     @classmethod
     def identity(cls, size: int) -> Normalizer:
-        """Leaves states of ``size`` entries as they are; also what a saved normaliser is loaded into."""
+        """Leaves states of ``size`` entries as they are; a saved normaliser is loaded into it."""
         return cls(torch.zeros(size), torch.ones(size))
 
     def forward(self, states: Tensor) -> Tensor:

@@ -28,13 +28,14 @@ PLACEMENTS = ("shifted", "shifted_first", "nearest", "next")
 
 
 class TargetPlacement:
-    """Chooses grid point and state for a target ``step`` steps away, the same in training and in planning.
+    """Chooses grid point and state for a target ``step`` steps away, in training as in planning.
 
-    - ``"shifted"``: the nearest grid point >= 1 of each level whose span holds the step; what is pinned there is the state
-      of the target's own episode at that grid point's time.
+    - ``"shifted"``: the nearest grid point >= 1 of each level whose span holds the step; what is
+      pinned there is the state of the target's own episode at that grid point's time.
     - ``"shifted_first"``: the same on the first level only.
-    - ``"nearest"`` and ``"next"``: the target itself, at the nearest grid point or the next one, on each such level. The
-      plan is then told to be there at another time than it can be (the paper read literally).
+    - ``"nearest"`` and ``"next"``: the target itself, at the nearest grid point or the next one, on
+      each such level. The plan is then told to be there at another time than it can be (the paper
+      read literally).
 
     Args:
         name (str): one of the above.

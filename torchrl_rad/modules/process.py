@@ -28,9 +28,10 @@ class Process(Protocol):
 
 
 class RectifiedFlow:
-    """Straight lines from data to noise; the network predicts the velocity towards the data (Liu et al., 2023).
+    """Straight lines from data to noise (Liu et al., 2023).
 
-    The sampler is Euler's, on DiffuserLite's grid (i / n)^1.5, which is finer near the data.
+    The network predicts the velocity towards the data. The sampler is Euler's, on DiffuserLite's
+    grid (i / n)^1.5, which is finer near the data.
 
     Examples:
         >>> flow = RectifiedFlow()
@@ -55,9 +56,10 @@ class RectifiedFlow:
 
 
 class Diffusion:
-    """Variance-preserving diffusion on the cosine schedule in continuous time; the network predicts the clean data.
+    """Variance-preserving diffusion on the cosine schedule in continuous time.
 
-    The sampler is DDIM's (Song et al., 2021), without noise between steps; the last step returns the prediction itself.
+    The network predicts the clean data. The sampler is DDIM's (Song et al., 2021), without noise
+    between steps; the last step returns the prediction itself.
 
     Examples:
         >>> diffusion = Diffusion()
@@ -101,7 +103,7 @@ def make_process(name: str) -> Process:
     Raises:
         ValueError: another name.
     """
-    processes = {"flow": RectifiedFlow, "diffusion": Diffusion}
+    processes: dict[str, type[Process]] = {"flow": RectifiedFlow, "diffusion": Diffusion}
     if name not in processes:
         raise ValueError(f"process is {name!r}; expected one of {sorted(processes)}.")
     return processes[name]()

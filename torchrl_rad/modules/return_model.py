@@ -11,7 +11,9 @@ __all__ = ["ReturnModel"]
 
 
 class ReturnModel(nn.Module):
-    """MLP that predicts C(tau) of a plan (J of RAD, equation "loss:g") from the states on its first level's grid.
+    """MLP that predicts C(tau) of a plan from the states on its first level's grid.
+
+    It is J of RAD, equation "loss:g".
 
     Args:
         normalizer (Normalizer): of states.

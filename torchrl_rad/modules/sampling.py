@@ -13,7 +13,7 @@ __all__ = ["inpaint", "sample_plan"]
 
 
 def inpaint(values: Tensor, known: Tensor, mask: Tensor) -> Tensor:
-    """Overwrites the known entries; ``mask`` [..., L, 1] or [..., L, D] is True where they are known."""
+    """Overwrites the known entries: where ``mask`` [..., L, 1] or [..., L, D] is True."""
     return torch.where(mask, known, values)
 
 
@@ -27,7 +27,8 @@ def sample_plan(
 ) -> Tensor:
     """Turns noise into plans that hold the known entries.
 
-    The known entries are written before each call of the network and at the end (RAD, section "Planning Module").
+    The known entries are written before each call of the network and at the end (RAD, section
+    "Planning Module").
 
     Args:
         process (Process): the generative process.
@@ -44,7 +45,8 @@ def sample_plan(
         >>> from torchrl_rad.modules.process import RectifiedFlow
         >>> noise = torch.zeros(1, 3, 1)
         >>> known, mask = torch.ones(1, 3, 1), torch.tensor([True, False, False])[None, :, None]
-        >>> sample_plan(RectifiedFlow(), lambda x, mask, time: x + 2.0, noise, known, mask, 1).squeeze()
+        >>> network = lambda x, mask, time: x + 2.0
+        >>> sample_plan(RectifiedFlow(), network, noise, known, mask, steps=1).squeeze()
         tensor([1., 2., 2.])
     """
     sample = inpaint(noise, known, mask)

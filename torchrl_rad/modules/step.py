@@ -17,30 +17,34 @@ __all__ = ["StepEstimator"]
 
 
 class StepEstimator(TensorDictModuleBase):
-    """Estimates the steps from a state to a target, 1 to H - 1 (RAD, section "Step Estimation Model").
+    """Estimates the steps from a state to a target, 1 to H - 1.
 
-    An MLP on both states, standardised, with H - 1 classes; class c means c + 1 steps. ``estimate="recorded"`` needs no
-    network: it hands on the recorded distance that :class:`RetrievalTargetModule` writes as ``target_offset``.
+    It is f_e of RAD, section "Step Estimation Model".
 
-    ===================  ==================================  ==============================================
+    An MLP on both states, standardised, with H - 1 classes; class c means c + 1 steps.
+    ``estimate="recorded"`` needs no network: it hands on the recorded distance that
+    :class:`RetrievalTargetModule` writes as ``target_offset``.
+
+    ===================  ==================================  =============================
     key                  shape, dtype                        meaning
-    ===================  ==================================  ==============================================
+    ===================  ==================================  =============================
     ``observation``      [*B, S], read                       state, raw units
     ``target``           [*B, S], read                       target, raw units
     ``target_offset``    [*B, 1] int64, read if "recorded"   recorded steps to the target
     ``target_step``      [*B, 1] int64                       estimated steps, 1 to H - 1
     ``step_logits``      [*B, H - 1], on demand              scores of the classes
-    ===================  ==================================  ==============================================
+    ===================  ==================================  =============================
 
     Args:
         normalizer (Normalizer): of states.
         horizon (int): H.
         width (int, optional): Defaults to ``256``.
-        activation (str, optional): ``"softmax"``: classes exclude each other; ``"sigmoid"``: one against the rest, as the
-            paper prints it. Defaults to ``"softmax"``.
-        estimate (str, optional): ``"mode"``, ``"median"`` or ``"mean"`` of the classes, or ``"recorded"``. Defaults to
-            ``"mode"``.
-        in_keys (sequence of NestedKey, optional): state and target, and the offset if ``"recorded"``.
+        activation (str, optional): ``"softmax"``: classes exclude each other; ``"sigmoid"``: one
+            against the rest, as the paper prints it. Defaults to ``"softmax"``.
+        estimate (str, optional): ``"mode"``, ``"median"`` or ``"mean"`` of the classes, or
+            ``"recorded"``. Defaults to ``"mode"``.
+        in_keys (sequence of NestedKey, optional): state and target, and the offset if
+            ``"recorded"``.
         out_keys (sequence of NestedKey, optional): the steps; a second one asks for the logits.
 
     Raises:
@@ -49,7 +53,8 @@ class StepEstimator(TensorDictModuleBase):
     Examples:
         >>> from tensordict import TensorDict
         >>> estimator = StepEstimator(Normalizer.identity(2), horizon=9)
-        >>> out = estimator(TensorDict({"observation": torch.zeros(3, 2), "target": torch.ones(3, 2)}, [3]))
+        >>> pairs = {"observation": torch.zeros(3, 2), "target": torch.ones(3, 2)}
+        >>> out = estimator(TensorDict(pairs, [3]))
         >>> out["target_step"].shape, bool((out["target_step"] >= 1).all())
         (torch.Size([3, 1]), True)
     """
@@ -70,7 +75,9 @@ class StepEstimator(TensorDictModuleBase):
         if activation not in ("softmax", "sigmoid"):
             raise ValueError(f"activation is {activation!r}; expected 'softmax' or 'sigmoid'.")
         if estimate not in ("mode", "median", "mean", "recorded"):
-            raise ValueError(f"estimate is {estimate!r}; expected 'mode', 'median', 'mean' or 'recorded'.")
+            raise ValueError(
+                f"estimate is {estimate!r}; expected 'mode', 'median', 'mean' or 'recorded'."
+            )
         if in_keys is None:
             in_keys = ["observation", "target"] + ["target_offset"] * (estimate == "recorded")
         self.in_keys, self.out_keys = list(in_keys), list(out_keys)
@@ -89,18 +96,19 @@ class StepEstimator(TensorDictModuleBase):
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes the estimated steps into ``tensordict`` and returns it."""
-        logits = None
-        if self.estimate != "recorded" or len(self.out_keys) > 1:
-            # a state with NaN has itself, without them, as its target
-            state = torch.nan_to_num(tensordict.get(self.in_keys[0]), nan=0.0, posinf=0.0, neginf=0.0)
-            logits = self.logits(state, tensordict.get(self.in_keys[1]))
-        if self.estimate == "recorded":
+        recorded = self.estimate == "recorded"
+        if recorded:
             step = tensordict.get(self.in_keys[2]).clamp(1, self.horizon - 1)
-        else:
-            step = self._steps(logits)
-        tensordict.set(self.out_keys[0], step)
-        if len(self.out_keys) > 1:
-            tensordict.set(self.out_keys[1], logits)
+            tensordict.set(self.out_keys[0], step)
+        if not recorded or len(self.out_keys) > 1:
+            # a state with NaN has itself, without them, as its target
+            state = tensordict.get(self.in_keys[0])
+            state = torch.nan_to_num(state, nan=0.0, posinf=0.0, neginf=0.0)
+            logits = self.logits(state, tensordict.get(self.in_keys[1]))
+            if not recorded:
+                tensordict.set(self.out_keys[0], self._steps(logits))
+            if len(self.out_keys) > 1:
+                tensordict.set(self.out_keys[1], logits)
         return tensordict
 
     def _steps(self, logits: Tensor) -> Tensor:

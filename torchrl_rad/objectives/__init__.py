@@ -4,4 +4,10 @@ from torchrl_rad.objectives.denoising import DenoisingLoss
 from torchrl_rad.objectives.guidance import ReturnGuidanceLoss, plan_return
 from torchrl_rad.objectives.step import StepEstimationLoss, draw_step_pairs
 
-__all__ = ["DenoisingLoss", "ReturnGuidanceLoss", "StepEstimationLoss", "draw_step_pairs", "plan_return"]
+__all__ = [
+    "DenoisingLoss",
+    "ReturnGuidanceLoss",
+    "StepEstimationLoss",
+    "draw_step_pairs",
+    "plan_return",
+]

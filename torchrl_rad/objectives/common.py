@@ -11,16 +11,19 @@ from torch import Tensor
 __all__ = ["window_masks"]
 
 
-def window_masks(masks: tuple, tensordict: TensorDictBase, shape: torch.Size) -> tuple[TensorDict, Tensor | None]:
+def window_masks(
+    masks: tuple, tensordict: TensorDictBase, shape: torch.Size
+) -> tuple[TensorDict, Tensor | None]:
     """Masks of steps as masks of windows: a window counts if all its steps do.
 
     Args:
-        masks (tuple of NestedKey): entries that may hold a mask of shape [*B], [*B, H] or [*B, H, 1].
+        masks (tuple of NestedKey): entries that may hold a mask, [*B], [*B, H] or [*B, H, 1].
         tensordict (TensorDictBase): the loss's input.
         shape (torch.Size): [*B].
 
     Returns:
-        A TensorDict with those masks as bool [*B], for ``LossModule._reduce_loss``, and all of them in one, or None.
+        A TensorDict with those masks as bool [*B], for ``LossModule._reduce_loss``, and all of them
+        in one, or None.
     """
     found: dict[Any, Tensor] = {}
     for key in masks:

@@ -19,35 +19,43 @@ __all__ = ["DenoisingLoss"]
 
 
 class DenoisingLoss(LossModule):
-    r"""Generation loss with pseudo targets (L_d of RAD, equation "loss:difusion"), for every level of a planner.
+    r"""Generation loss with pseudo targets, for every level of a planner.
 
-    Each window of H states gives each level a random piece of its span. A step i, uniform over the span, chooses the pseudo
-    target, which the planner's own placement puts on the grid; a share of the pieces has none, so that rows without a target
-    can be planned by the same network. Known states (the first; the last on finer levels; the target) are shown clean and
-    do not enter the loss:
+    It is L_d of RAD, equation "loss:difusion".
+
+    Each window of H states gives each level a random piece of its span. A step i, uniform over the
+    span, chooses the pseudo target, which the planner's own placement puts on the grid; a share of
+    the pieces has none, so that rows without a target can be planned by the same network. Known
+    states (the first; the last on finer levels; the target) are shown clean and do not enter the
+    loss:
 
     .. math:: L_d = E \| w \odot (1 - m) \odot (\phi_\theta(\hat\tau^k, m, k) - y) \|^2
 
-    with y the velocity (flow) or the clean states (diffusion), m the mask of the known ones and w the weight of the state
-    after the current one, which is what a plan is used for.
+    with y the velocity (flow) or the clean states (diffusion), m the mask of the known ones and w
+    the weight of the state after the current one, which is what a plan is used for.
 
     Args:
         planner (DiffuserLitePlanner): whose networks are trained.
 
     Keyword Args:
-        no_target (float, optional): share of pieces without a target; a planner with ``targets=False`` has none at all.
-            Defaults to ``0.2``.
-        next_weight (float, optional): weight of grid point 1. Defaults to ``10.0`` (DiffuserLite's).
-        delay (bool, optional): keep target parameters, for :class:`torchrl.objectives.SoftUpdate`. Defaults to ``False``.
-        reduction (str, optional): ``"none"``, ``"mean"`` or ``"sum"`` over windows. Defaults to ``"mean"``.
+        no_target (float, optional): share of pieces without a target; a planner with
+            ``targets=False`` has none at all. Defaults to ``0.2``.
+        next_weight (float, optional): weight of grid point 1. Defaults to ``10.0``
+            (DiffuserLite's).
+        delay (bool, optional): keep target parameters, for :class:`torchrl.objectives.SoftUpdate`.
+            Defaults to ``False``.
+        reduction (str, optional): ``"none"``, ``"mean"`` or ``"sum"`` over windows. Defaults to
+            ``"mean"``.
 
-    .. note:: The tensordict passed to :meth:`forward` must contain ``self.tensor_keys.observation``, windows [*B, H, S] of
-        raw states. Masks (``("collector", "mask")``, ...) may be [*B] or [*B, H]: a window counts if all its steps do.
+    .. note:: The tensordict passed to :meth:`forward` must contain
+        ``self.tensor_keys.observation``, windows [*B, H, S] of raw states. Masks (``("collector",
+        "mask")``, ...) may be [*B] or [*B, H]: a window counts if all its steps do.
 
     Examples:
         >>> from torchrl_rad import InverseDynamics, Normalizer
         >>> states = Normalizer.identity(2)
-        >>> planner = DiffuserLitePlanner(states, InverseDynamics(states, states, 1), horizon=9, jumps=(4, 1), width=32)
+        >>> inverse = InverseDynamics(states, states, 1)
+        >>> planner = DiffuserLitePlanner(states, inverse, horizon=9, jumps=(4, 1), width=32)
         >>> loss = DenoisingLoss(planner)
         >>> out = loss(TensorDict({"observation": torch.randn(6, 9, 2)}, [6]))
         >>> out["loss_denoising"].shape, sorted(out.keys())
@@ -85,8 +93,8 @@ class DenoisingLoss(LossModule):
         self._in_keys: list[NestedKey] | None = None
         self.convert_to_functional(planner.networks, "network", create_target_params=delay)
         self.planner_normalizer = planner.normalizer
-        self.levels, self.process, self.placement = planner.levels, planner.process, planner.placement
-        self.horizon = planner.horizon
+        self.levels, self.horizon = planner.levels, planner.horizon
+        self.process, self.placement = planner.process, planner.placement
         self.no_target = no_target if planner.targets else 1.0
         self.next_weight = next_weight
         self.reduction = "mean" if reduction is None else reduction
@@ -119,8 +127,8 @@ class DenoisingLoss(LossModule):
         windows = tensordict.get(self.tensor_keys.observation)
         if windows.ndim < 2 or windows.shape[-2] != self.horizon:
             raise ValueError(
-                f"{self.tensor_keys.observation!r} is {tuple(windows.shape)}; expected windows [*B, {self.horizon}, S], "
-                "the horizon that the planner was built for."
+                f"{self.tensor_keys.observation!r} is {tuple(windows.shape)}; expected windows "
+                f"[*B, {self.horizon}, S], the horizon that the planner was built for."
             )
         shape = windows.shape[:-2]
         masks, counted = window_masks(self._loss_mask_keys(), tensordict, shape)
@@ -128,7 +136,8 @@ class DenoisingLoss(LossModule):
             windows = torch.where(counted[..., None, None], windows, 0.0)
         windows = self.planner_normalizer(windows.reshape(-1, *windows.shape[-2:]))
         with self.network_params.to_module(self.network):
-            losses = [self._level(number, windows).reshape(shape) for number in range(len(self.levels))]
+            levels = range(len(self.levels))
+            losses = [self._level(number, windows).reshape(shape) for number in levels]
         out = {"loss_denoising": self._reduce_loss(torch.stack(losses).sum(0), masks)}
         for number, value in enumerate(losses):
             out[f"level_{number}"] = self._reduce_loss(value.detach(), masks, reduction="mean")
@@ -169,8 +178,9 @@ class DenoisingLoss(LossModule):
         step = torch.randint(1, level.span + 1, (count,), device=device)
         place = self.placement(step, number, *level)
         pinned = place.active & (torch.rand(count, device=device) >= self.no_target)
-        # a shifted placement pins the window's own state; others move the state at `step` to the grid point
+        # a shifted placement pins the window's own state; others move that at `step` to the grid
         moved = windows[rows, begin + place.time]
-        here = (torch.arange(level.tokens, device=device) == place.token[:, None]) & pinned[:, None]
+        here = torch.arange(level.tokens, device=device) == place.token[:, None]
+        here &= pinned[:, None]
         clean = torch.where(here[..., None], moved[:, None], clean)
         return clean, (mask | here)[..., None]

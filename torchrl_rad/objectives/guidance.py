@@ -53,17 +53,18 @@ class ReturnGuidanceLoss(LossModule):
     Keyword Args:
         jump (int): step of the grid on which J sees a window.
         gamma (float, optional): discount. Defaults to ``0.99``.
-        reduction (str, optional): ``"none"``, ``"mean"`` or ``"sum"`` over windows. Defaults to ``"mean"``.
+        reduction (str, optional): ``"none"``, ``"mean"`` or ``"sum"`` over windows. Defaults to
+            ``"mean"``.
 
-    .. note:: The tensordict passed to :meth:`forward` must contain ``self.tensor_keys.observation`` [*B, H, S],
-        ``reward`` [*B, H, 1] and ``value`` [*B, H, 1] or [*B, H], whose last entry is V(s_{H-1}): the recorded
-        return-to-go, or a learned value.
+    .. note:: The tensordict passed to :meth:`forward` must contain ``self.tensor_keys.observation``
+        [*B, H, S], ``reward`` [*B, H, 1] and ``value`` [*B, H, 1] or [*B, H], whose last entry is
+        V(s_{H-1}): the recorded return-to-go, or a learned value.
 
     Examples:
         >>> from torchrl_rad import Normalizer
         >>> loss = ReturnGuidanceLoss(ReturnModel(Normalizer.identity(2), tokens=3), jump=4)
-        >>> windows = TensorDict({"observation": torch.zeros(5, 9, 2), "next": {"reward": torch.zeros(5, 9, 1)},
-        ...     "return_to_go": torch.zeros(5, 9)}, [5])
+        >>> windows = TensorDict({"observation": torch.zeros(5, 9, 2),
+        ...     "next": {"reward": torch.zeros(5, 9, 1)}, "return_to_go": torch.zeros(5, 9)}, [5])
         >>> loss(windows)["loss_guidance"].shape
         torch.Size([])
     """
@@ -106,7 +107,8 @@ class ReturnGuidanceLoss(LossModule):
     @property
     def in_keys(self) -> list[NestedKey]:
         if self._in_keys is None:
-            self._in_keys = [self.tensor_keys.observation, self.tensor_keys.reward, self.tensor_keys.value]
+            keys = self.tensor_keys
+            self._in_keys = [keys.observation, keys.reward, keys.value]
         return self._in_keys
 
     @in_keys.setter
@@ -133,10 +135,11 @@ class ReturnGuidanceLoss(LossModule):
             predicted = self.return_model.standardised(states[..., :: self.jump, :])
             unit, centre = self.return_model.deviation, self.return_model.mean
         error = predicted - (target - centre) / unit
+        error_in_returns = (error * unit).abs().detach()
         out = TensorDict(
             {
                 "loss_guidance": self._reduce_loss(error.square(), masks),
-                "return_error": self._reduce_loss((error * unit).abs().detach(), masks, reduction="mean"),
+                "return_error": self._reduce_loss(error_in_returns, masks, reduction="mean"),
             }
         )
         self._clear_weakrefs(tensordict, out, "return_model_params")

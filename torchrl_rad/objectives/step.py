@@ -20,7 +20,7 @@ __all__ = ["StepEstimationLoss", "draw_step_pairs"]
 
 
 def draw_step_pairs(windows: Tensor, generator: torch.Generator | None = None) -> TensorDict:
-    """Pairs (s_t, s_{t+i}) with i uniform in 1..H-1 and t uniform in what room is left, one from each window.
+    """Pairs (s_t, s_{t+i}), one from each window: i uniform in 1..H-1, t in what room is left.
 
     A window lies inside one episode, and so does a pair.
 
@@ -42,7 +42,8 @@ def draw_step_pairs(windows: Tensor, generator: torch.Generator | None = None) -
     step = torch.randint(1, horizon, (count,), generator=generator, device=windows.device)
     room = (horizon - step).float()
     begin = (torch.rand(count, generator=generator, device=windows.device) * room).long()
-    pairs = {"observation": windows[rows, begin], "target": windows[rows, begin + step], "target_step": step[:, None]}
+    state, target = windows[rows, begin], windows[rows, begin + step]
+    pairs = {"observation": state, "target": target, "target_step": step[:, None]}
     return TensorDict(pairs, [count])
 
 
@@ -51,8 +52,9 @@ class StepEstimationLoss(LossModule):
 
     .. math:: L_e = -E \log e[i]
 
-    with softmax over the classes. The paper prints a sigmoid and this loss; nothing then pushes the other classes down, so
-    ``activation="sigmoid"`` of the estimator is trained one class against the rest.
+    with softmax over the classes. The paper prints a sigmoid and this loss; nothing then pushes the
+    other classes down, so ``activation="sigmoid"`` of the estimator is trained one class against
+    the rest.
 
     Args:
         estimator (StepEstimator): f_e.
@@ -60,8 +62,9 @@ class StepEstimationLoss(LossModule):
     Keyword Args:
         reduction (str, optional): ``"none"``, ``"mean"`` or ``"sum"``. Defaults to ``"mean"``.
 
-    .. note:: The tensordict passed to :meth:`forward` must contain ``self.tensor_keys.observation`` and ``target``
-        [*B, S] and ``target_step`` [*B, 1] int64, the true number of steps, 1 to H - 1 (see :func:`draw_step_pairs`).
+    .. note:: The tensordict passed to :meth:`forward` must contain ``self.tensor_keys.observation``
+        and ``target`` [*B, S] and ``target_step`` [*B, 1] int64, the true number of steps, 1 to H -
+        1 (see :func:`draw_step_pairs`).
 
     Examples:
         >>> from torchrl_rad import Normalizer
@@ -92,7 +95,9 @@ class StepEstimationLoss(LossModule):
     estimator_params: TensorDictParams
     target_estimator_params: TensorDictParams
 
-    def __init__(self, estimator: StepEstimator, *, reduction: Literal["none", "mean", "sum"] | None = None):
+    def __init__(
+        self, estimator: StepEstimator, *, reduction: Literal["none", "mean", "sum"] | None = None
+    ):
         super().__init__()
         self._in_keys: list[NestedKey] | None = None
         self.convert_to_functional(estimator, "estimator")
@@ -101,7 +106,8 @@ class StepEstimationLoss(LossModule):
     @property
     def in_keys(self) -> list[NestedKey]:
         if self._in_keys is None:
-            self._in_keys = [self.tensor_keys.observation, self.tensor_keys.target, self.tensor_keys.target_step]
+            keys = self.tensor_keys
+            self._in_keys = [keys.observation, keys.target, keys.target_step]
         return self._in_keys
 
     @in_keys.setter
@@ -121,7 +127,8 @@ class StepEstimationLoss(LossModule):
         shape = state.shape[:-1]
         masks, counted = window_masks(self._loss_mask_keys(), tensordict, shape)
         if counted is not None:  # what is masked may be NaN, also in the backward pass
-            state, target = (torch.where(counted[..., None], value, 0.0) for value in (state, target))
+            state = torch.where(counted[..., None], state, 0.0)
+            target = torch.where(counted[..., None], target, 0.0)
         with self.estimator_params.to_module(self.estimator):
             logits = self.estimator.logits(state, target)
             error = (self.estimator._steps(logits.detach()) - step).abs().float().squeeze(-1)
@@ -138,6 +145,7 @@ class StepEstimationLoss(LossModule):
         """Loss of each pair [*B]; ``label`` counts from 0."""
         label = label.clamp(0, logits.shape[-1] - 1)
         if self.estimator.activation == "softmax":
-            return F.cross_entropy(logits.flatten(0, -2), label.flatten(), reduction="none").reshape(label.shape)
+            loss = F.cross_entropy(logits.flatten(0, -2), label.flatten(), reduction="none")
+            return loss.reshape(label.shape)
         one_hot = F.one_hot(label, logits.shape[-1]).to(logits.dtype)
         return F.binary_cross_entropy_with_logits(logits, one_hot, reduction="none").sum(-1)
