@@ -11,19 +11,27 @@ from torchrl_rad.data.experts import (
     subtasks_done,
     top_share_by_return,
 )
+from torchrl_rad.data.minari import check_content, join_stream, load_minari
 from torchrl_rad.data.pointmaze import collect_pointmaze, pointmaze_dataset
+from torchrl_rad.data.report import DataReport
+from torchrl_rad.data.report import report as data_report  # "report" is the module
 from torchrl_rad.data.windows import Window, WindowSampler, window_buffer
 
 __all__ = [
+    "DataReport",
     "Expert",
     "ExpertDatabase",
     "Window",
     "WindowSampler",
+    "check_content",
     "collect_pointmaze",
+    "data_report",
     "episode_length",
     "episode_lengths",
     "expert_from_config",
     "first_hit_within",
+    "join_stream",
+    "load_minari",
     "pointmaze_dataset",
     "reaches_goal",
     "return_to_go",

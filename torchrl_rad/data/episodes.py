@@ -6,21 +6,22 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-__all__ = ["episode_lengths", "return_to_go", "step_and_remaining"]
+__all__ = ["episode_ids", "episode_lengths", "return_to_go", "step_and_remaining"]
 
 
 def episode_lengths(steps: TensorDictBase) -> Tensor:
     """Lengths of the episodes of a flat table, in the order in which they lie there.
 
-    Episodes are told apart by ``"episode"`` (int64 [T]) where there is one, by ``("next", "done")`` (bool [T, 1])
-    otherwise.
+    Episodes are told apart by the first of these that there is: ``"episode"`` (int64 [T]), the
+    ``("collector", "traj_ids")`` of TorchRL's collectors, ``("next", "done")`` (bool [T, 1]).
 
     Returns:
         int64 [E], whose sum is T.
 
     Raises:
-        KeyError: neither entry is there.
-        ValueError: an id comes back after another one, or the last episode has no end.
+        KeyError: none of the entries is there.
+        ValueError: an id comes back after another one, or an episode that was not given by
+            ``"episode"`` has no end.
 
     Examples:
         >>> from tensordict import TensorDict
@@ -30,27 +31,65 @@ def episode_lengths(steps: TensorDictBase) -> Tensor:
     count = steps.batch_size[0]
     if count == 0:
         return torch.zeros(0, dtype=torch.int64)
-    ids = steps.get("episode", None)
+    ids, done = _given_ids(steps), steps.get(("next", "done"), None)
     if ids is not None:
-        ids, lengths = torch.unique_consecutive(ids.reshape(count).cpu(), return_counts=True)
-        if len(torch.unique(ids)) != len(ids):
-            values, times = torch.unique(ids, return_counts=True)
-            raise ValueError(
-                f"the rows of episode {values[times > 1][0].item()} do not lie together; "
-                "sort the steps by episode, in recorded order."
-            )
-        return lengths
-    done = steps.get(("next", "done"), None)
-    if done is None:
-        raise KeyError('steps need "episode" [T] or ("next", "done") [T, 1] to tell episodes apart.')
-    ends = done.reshape(count).cpu().nonzero().squeeze(-1)
-    if len(ends) == 0 or ends[-1] != count - 1:
-        begun = 0 if len(ends) == 0 else ends[-1].item() + 1
-        raise ValueError(
-            f"the episode that begins at row {begun} has no end: ('next', 'done') is False at the last row, "
-            f"{count - 1}; pass whole episodes."
+        lengths = _runs(ids)
+        if "episode" in steps.keys() or done is None:
+            return lengths
+        ends = lengths.cumsum(0) - 1
+    elif done is not None:
+        ends = done.reshape(count).cpu().nonzero().squeeze(-1)
+        ends = torch.cat([ends[ends < count - 1], ends.new_tensor([count - 1])])
+        lengths = torch.diff(ends, prepend=ends.new_tensor([-1]))
+    else:
+        raise KeyError(
+            'steps need "episode" [T] or ("next", "done") [T, 1] to tell episodes apart.'
         )
-    return torch.diff(ends, prepend=ends.new_tensor([-1]))
+    cut = ~done.reshape(count).cpu()[ends]
+    if cut.any():
+        last = int(ends[cut][0])
+        raise ValueError(
+            f"the episode that begins at row {last + 1 - int(lengths[cut][0])} has no end: "
+            f"('next', 'done') is False at its last row, {last}; pass whole episodes (a collector "
+            "gives them with trajs_per_batch=n, traj_format='cat')."
+        )
+    return lengths
+
+
+def episode_ids(steps: TensorDictBase, lengths: Tensor) -> Tensor:
+    """The ids given with the steps, or the numbers of the episodes: int64 [T] on the CPU.
+
+    Examples:
+        >>> from tensordict import TensorDict
+        >>> episode_ids(TensorDict({}, [3]), torch.tensor([2, 1]))
+        tensor([0, 0, 1])
+    """
+    ids = _given_ids(steps)
+    return torch.repeat_interleave(torch.arange(len(lengths)), lengths) if ids is None else ids
+
+
+def _given_ids(steps: TensorDictBase) -> Tensor | None:
+    for key in ("episode", ("collector", "traj_ids")):
+        ids = steps.get(key, None)
+        if ids is None:
+            continue
+        if ids.numel() != len(steps) or ids.is_floating_point():
+            raise ValueError(
+                f"{key!r} must be one whole number a step, [T]; got {ids.dtype} {list(ids.shape)}."
+            )
+        return ids.reshape(-1).cpu().long()
+    return None
+
+
+def _runs(ids: Tensor) -> Tensor:
+    ids, lengths = torch.unique_consecutive(ids, return_counts=True)
+    values, times = torch.unique(ids, return_counts=True)
+    if len(values) != len(ids):
+        raise ValueError(
+            f"the rows of episode {values[times > 1][0].item()} do not lie together; "
+            "sort the steps by episode, in recorded order."
+        )
+    return lengths
 
 
 def step_and_remaining(lengths: Tensor) -> tuple[Tensor, Tensor]:

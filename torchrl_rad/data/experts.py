@@ -21,13 +21,17 @@ __all__ = [
 
 
 class Expert:
-    """A named rule that says which episodes are demonstrations; rules combine with ``&``, ``|`` and ``~``.
+    """A named rule that says which episodes are demonstrations.
 
-    Calling it with one episode (a TensorDict [L]) gives a bool. ``select`` answers for a list of episodes and is what
-    :class:`~torchrl_rad.data.ExpertDatabase` asks, since some rules compare episodes with each other.
+    Rules combine with ``&``, ``|`` and ``~``.
+
+    Calling it with one episode (a TensorDict [L]) gives a bool. ``select`` answers for a list of
+    episodes and is what :class:`~torchrl_rad.data.ExpertDatabase` asks, since some rules compare
+    episodes with each other.
 
     Args:
-        config (dict): name and arguments, from which :func:`expert_from_config` builds the rule again.
+        config (dict): name and arguments, from which :func:`expert_from_config` builds the rule
+            again.
         predicate (callable): one episode -> bool.
 
     Examples:
@@ -106,9 +110,12 @@ def episode_length(steps: int) -> Expert:
 
 
 def first_hit_within(low: int, high: int) -> Expert:
-    """Episodes that first earn a positive reward at a step in [low, high] (the paper's rule for mazes).
+    """Episodes that first earn a positive reward at a step in [low, high].
 
-    The reward of row i is that of the state after it, so that the step of the first hit is the row's number plus one.
+    The paper's rule for mazes.
+
+    The reward of row i is that of the state after it, so that the step of the first hit is the
+    row's number plus one.
 
     Raises:
         ValueError: ``low`` is larger than ``high``.
@@ -125,17 +132,22 @@ def first_hit_within(low: int, high: int) -> Expert:
 
 def reaches_goal() -> Expert:
     """Episodes that earn a positive reward at some step."""
-    return Expert({"rule": "reaches_goal", "args": []}, lambda episode: bool((_rewards(episode) > 0).any()))
+    return Expert(
+        {"rule": "reaches_goal", "args": []}, lambda episode: bool((_rewards(episode) > 0).any())
+    )
 
 
 def subtasks_done(count: int) -> Expert:
-    """Episodes whose step reward reaches ``count`` (Kitchen: tasks in place at that step; the paper's rule is 3)."""
+    """Episodes whose step reward reaches ``count`` (Kitchen: tasks in place; the paper has 3)."""
     config = {"rule": "subtasks_done", "args": [count]}
     return Expert(config, lambda episode: bool((_rewards(episode) >= count).any()))
 
 
 def top_share_by_return(share: float) -> Expert:
-    """The given share of the episodes added together, by undiscounted return; equal returns are kept together.
+    """The best of the episodes added together, by undiscounted return; equal ones stay together.
+
+    Args:
+        share (float): share of the episodes to keep, in (0, 1]; at least one is kept.
 
     Raises:
         ValueError: ``share`` lies outside (0, 1].

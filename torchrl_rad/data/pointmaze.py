@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-import shutil
+import warnings
 from collections import deque
 from pathlib import Path
 
@@ -14,6 +14,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from tqdm import tqdm
 
+from torchrl_rad._files import CheckpointError, staged_folder, verify_manifest, write_json
 from torchrl_rad.envs.maze import FixedGoalMaze, MazeTask, maze_task
 
 __all__ = ["cache_dir", "collect_pointmaze", "next_cells", "pointmaze_dataset"]
@@ -23,7 +24,7 @@ POSITION_GAIN = 10.0
 VELOCITY_GAIN = -1.0
 ACTION_NOISE = 0.5
 WAYPOINT_RADIUS = 0.1  # a waypoint is solved within this distance
-FORMAT = 1  # raise it when the content of the cache changes
+FORMAT = 2  # raise it when the content of the cache changes
 
 
 def cache_dir() -> Path:
@@ -32,13 +33,14 @@ def cache_dir() -> Path:
 
 
 def next_cells(free: np.ndarray) -> np.ndarray:
-    """For each pair of free cells the next cell on a shortest path, by breadth-first search from each goal.
+    """For each pair of free cells the next cell on a shortest path, by breadth-first search.
 
     Args:
         free: int [n, 2], (row, column) of the free cells.
 
     Returns:
-        int [n, n]: entry (i, j) is the cell to go to in cell i on the way to cell j; j itself on the diagonal.
+        int [n, n]: entry (i, j) is the cell to go to in cell i on the way to cell j; j itself on
+        the diagonal, -1 where no path leads there.
 
     Examples:
         >>> next_cells(np.array([[1, 1], [1, 2], [1, 3]])).tolist()
@@ -52,14 +54,21 @@ def next_cells(free: np.ndarray) -> np.ndarray:
         while queue:
             row, column = queue.popleft()
             here = number[row, column]
-            for near in ((row + 1, column), (row - 1, column), (row, column + 1), (row, column - 1)):
+            for near in (
+                (row + 1, column),
+                (row - 1, column),
+                (row, column + 1),
+                (row, column - 1),
+            ):
                 if near in number and table[number[near], goal] < 0:
                     table[number[near], goal] = here
                     queue.append(near)
     return table
 
 
-def collect_pointmaze(task: MazeTask, steps: int, seed: int = 0, progress: bool = True) -> TensorDict:
+def collect_pointmaze(
+    task: MazeTask, steps: int, seed: int = 0, progress: bool = True
+) -> TensorDict:
     """Records whole episodes of the waypoint controller (D4RL's Maze2D collection; RAD, appendix).
 
     Args:
@@ -69,14 +78,20 @@ def collect_pointmaze(task: MazeTask, steps: int, seed: int = 0, progress: bool 
         progress (bool, optional): show a progress bar. Defaults to ``True``.
 
     Returns:
-        Flat TensorDict [T]: ``observation`` [T, 4], ``action`` [T, 2], ``episode`` [T] int64 and under ``"next"``
-        the ``observation``, ``reward`` [T, 1] (for the task's goal), ``terminated``, ``truncated``, ``done``.
+        Flat TensorDict [T]: ``observation`` [T, 4], ``action`` [T, 2], ``episode`` [T] int64 and
+        under ``"next"`` the ``observation``, ``reward`` [T, 1] (for the task's goal),
+        ``terminated``, ``truncated``, ``done``.
+
+    Raises:
+        ValueError: ``steps`` is below 1.
 
     Examples:
         >>> data = collect_pointmaze(maze_task("umaze"), 300, progress=False)
         >>> data.shape, data["next", "done"].sum().item()
         (torch.Size([300]), 1)
     """
+    if steps < 1:
+        raise ValueError(f"steps is {steps}; at least one step is collected.")
     env = FixedGoalMaze(task)
     episodes = -(-steps // task.max_steps)
     states = np.empty((episodes, task.max_steps + 1, 4), np.float32)
@@ -84,7 +99,9 @@ def collect_pointmaze(task: MazeTask, steps: int, seed: int = 0, progress: bool 
     rng = np.random.default_rng(seed)
     env.reset(seed=seed)
     table = next_cells(env.free_cells)
-    bar = tqdm(range(episodes), desc=f"collecting {task.env_id}", unit="episode", disable=not progress)
+    bar = tqdm(
+        range(episodes), desc=f"collecting {task.env_id}", unit="episode", disable=not progress
+    )
     for episode in bar:
         _record(env, table, rng, states[episode], actions[episode])
     env.close()
@@ -142,7 +159,8 @@ def pointmaze_dataset(
 ) -> TensorDictBase:
     """The collected data of one maze, from the cache or collected now and cached.
 
-    The folder's name holds the settings; it appears only when the data is complete.
+    The folder's name holds the settings; it appears only when the data is complete. A damaged one
+    is replaced, with a warning.
 
     Args:
         maze (str): ``"umaze"``, ``"medium"`` or ``"large"``.
@@ -153,6 +171,18 @@ def pointmaze_dataset(
 
     Returns:
         The flat TensorDict of :func:`collect_pointmaze`, memory-mapped.
+
+    Raises:
+        KeyError: the maze is not known.
+        ValueError: ``steps`` is below 1.
+        OSError: the cache cannot be written.
+
+    Examples:
+        >>> import tempfile
+        >>> with tempfile.TemporaryDirectory() as root:
+        ...     data = pointmaze_dataset("umaze", 300, root=root, progress=False)
+        >>> data["action"].shape
+        torch.Size([300, 2])
     """
     task = maze_task(maze)
     settings = {
@@ -161,14 +191,24 @@ def pointmaze_dataset(
     }  # fmt: skip
     digest = hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()[:8]
     path = Path(root or cache_dir()) / f"pointmaze-{maze}-{steps}-seed{seed}-{digest}"
-    if not path.exists():
-        stage = path.with_name(f".{path.name}.{os.getpid()}")
-        shutil.rmtree(stage, ignore_errors=True)
+    if not _is_whole(path):
         data = collect_pointmaze(task, steps, seed, progress)
-        data.memmap(stage)
-        (stage / "settings.json").write_text(json.dumps(settings, indent=1))
         try:
-            stage.rename(path)
-        except OSError:  # another process was first: its data is the same
-            shutil.rmtree(stage)
-    return TensorDict.load_memmap(path)
+            with staged_folder(path, replace=True) as stage:
+                data.memmap(stage / "steps")
+                write_json(stage / "settings.json", settings)
+        except OSError:
+            if not _is_whole(path):  # else another process was faster: its data is the same
+                raise
+    return TensorDict.load_memmap(path / "steps")
+
+
+def _is_whole(path: Path) -> bool:
+    if not path.exists():
+        return False
+    try:
+        verify_manifest(path)
+    except CheckpointError as error:
+        warnings.warn(f"{error} The data is collected anew.", stacklevel=3)
+        return False
+    return True

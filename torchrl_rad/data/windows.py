@@ -20,7 +20,7 @@ __all__ = ["Window", "WindowSampler", "window_buffer"]
 
 
 class Window(SampleUnit):
-    """Expands each anchor row to the ``length`` rows that begin there: a batch [B] becomes [B * length].
+    """Expands each anchor row to the ``length`` rows that begin there: [B] becomes [B * length].
 
     Args:
         length (int): rows of a window.
@@ -33,7 +33,9 @@ class Window(SampleUnit):
     def __init__(self, length: int):
         self.length = length
 
-    def expand(self, index: Tensor, info: dict[str, Any], storage: Any) -> tuple[Tensor, dict[str, Any]]:
+    def expand(
+        self, index: Tensor, info: dict[str, Any], storage: Any
+    ) -> tuple[Tensor, dict[str, Any]]:
         rows = index[:, None] + torch.arange(self.length, device=index.device)
         info = {name: value.repeat_interleave(self.length, 0) for name, value in info.items()}
         return rows.reshape(-1), info
@@ -106,7 +108,9 @@ class WindowSampler(Sampler):
 def window_buffer(
     steps: TensorDictBase, length: int, batch_size: int, generator: torch.Generator | None = None
 ) -> TensorDictReplayBuffer:
-    """A replay buffer whose batches are windows, flat: ``sample().reshape(-1, length)`` gives them back.
+    """A replay buffer whose batches are windows, flat.
+
+    ``sample().reshape(-1, length)`` gives the windows back.
 
     Args:
         steps (TensorDictBase): flat table of whole episodes [T], used without a copy.

@@ -13,11 +13,13 @@ __all__ = ["ObservationAdapter"]
 class ObservationAdapter:
     """Turns an observation, recorded or live, into one flat float32 vector.
 
-    A dict observation is reduced to the named entries, concatenated in the order given; a plain array
-    is passed on. The same object serves the data loader and the environment, so that the two cannot differ.
+    A dict observation is reduced to the named entries, concatenated in the order given; a plain
+    array is passed on. The same object serves the data loader and the environment, so that the two
+    cannot differ.
 
     Args:
-        keys (sequence of str, optional): entries of a dict observation. Defaults to ``("observation",)``.
+        keys (sequence of str, optional): entries of a dict observation. Defaults to
+            ``("observation",)``.
 
     Raises:
         KeyError: an entry named in ``keys`` is missing.

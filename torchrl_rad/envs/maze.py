@@ -31,10 +31,10 @@ class MazeTask:
         env_id: gymnasium id of the maze.
         goal_cell: (row, column) of the fixed goal.
         max_steps: length of an episode.
-        reference_scores: returns of D4RL's random policy and controller (0 and 100 of the normalised
-            score; D4RL ``d4rl/infos.py``, maze2d-*-v1).
-        expert_steps: first and last step at which an expert episode of the paper first hits the goal
-            (RAD, appendix "Implementation Details").
+        reference_scores: returns of D4RL's random policy and controller (0 and 100 of the
+            normalised score; D4RL ``d4rl/infos.py``, maze2d-*-v1).
+        expert_steps: first and last step at which an expert episode of the paper first hits the
+            goal (RAD, appendix "Implementation Details").
     """
 
     name: str
@@ -75,8 +75,8 @@ def maze_task(name: str) -> MazeTask:
 class FixedGoalMaze(gym.Wrapper):
     """PointMaze with a fixed goal cell, uniform start cells and D4RL's reward.
 
-    The observation is the flat state (x, y, vx, vy); the reward is 1 for every step that ends within 0.5 of the
-    centre of the goal cell; an episode ends at the time limit only.
+    The observation is the flat state (x, y, vx, vy); the reward is 1 for every step that ends
+    within 0.5 of the centre of the goal cell; an episode ends at the time limit only.
 
     Args:
         task (MazeTask): the protocol.
@@ -99,14 +99,17 @@ class FixedGoalMaze(gym.Wrapper):
         gym.register_envs(gymnasium_robotics)
         super().__init__(gym.make(task.env_id, max_episode_steps=task.max_steps))
         self.adapter = ObservationAdapter()
-        self.unwrapped.position_noise_range = RESET_NOISE
-        self.maze = self.unwrapped.maze
+        robot: Any = self.unwrapped
+        robot.position_noise_range = RESET_NOISE
+        self.maze = robot.maze
         self.goal_cell = np.asarray(task.goal_cell if goal_cell is None else goal_cell)
         self.free_cells = free_cells(self.maze.maze_map)
         self.reset_cells = self.free_cells if reset_cell is None else np.asarray([reset_cell])
         for cell in (self.goal_cell, *self.reset_cells):
             if not (self.free_cells == cell).all(-1).any():
-                raise ValueError(f"cell {tuple(cell.tolist())} of {task.env_id} is a wall or outside the map.")
+                raise ValueError(
+                    f"cell {tuple(cell.tolist())} of {task.env_id} is a wall or outside the map."
+                )
         self.goal = self.maze.cell_rowcol_to_xy(self.goal_cell)
         self.observation_space = gym.spaces.Box(-np.inf, np.inf, (4,), np.float32)
 
@@ -127,14 +130,17 @@ class FixedGoalMaze(gym.Wrapper):
 
 def free_cells(maze_map: list[list[Any]]) -> np.ndarray:
     """(row, column) of every free cell of a maze map, in reading order: int [n, 2]."""
-    return np.asarray([(r, c) for r, row in enumerate(maze_map) for c, v in enumerate(row) if v != 1])
+    return np.asarray(
+        [(r, c) for r, row in enumerate(maze_map) for c, v in enumerate(row) if v != 1]
+    )
 
 
 def relabel_goal(episodes: TensorDictBase, goal: np.ndarray | Tensor) -> TensorDictBase:
     """Gives recorded steps the reward of another goal: 1 where the next state is within 0.5 of it.
 
     Args:
-        episodes (TensorDictBase): flat steps with ``("next", "observation")``, whose first two entries are x, y.
+        episodes (TensorDictBase): flat steps with ``("next", "observation")``, whose first two
+            entries are x, y.
         goal: x, y of the goal.
 
     Returns:
@@ -142,7 +148,8 @@ def relabel_goal(episodes: TensorDictBase, goal: np.ndarray | Tensor) -> TensorD
 
     Examples:
         >>> import torch
-        >>> steps = TensorDict({"next": {"observation": torch.tensor([[0.0, 0.4], [0.0, 0.6]])}}, [2])
+        >>> states = torch.tensor([[0.0, 0.4], [0.0, 0.6]])
+        >>> steps = TensorDict({"next": {"observation": states}}, [2])
         >>> relabel_goal(steps, [0.0, 0.0])["next", "reward"].squeeze(-1).tolist()
         [1.0, 0.0]
     """
@@ -150,14 +157,18 @@ def relabel_goal(episodes: TensorDictBase, goal: np.ndarray | Tensor) -> TensorD
     position = episodes["next", "observation"][..., :2]
     reward = ((position - goal).norm(dim=-1, keepdim=True) <= GOAL_RADIUS).float()
     out = episodes.copy()
-    out["next"] = TensorDict({**dict(episodes["next"].items()), "reward": reward}, episodes.batch_size)
+    out["next"] = TensorDict(
+        {**dict(episodes["next"].items()), "reward": reward}, episodes.batch_size
+    )
     return out
 
 
 def make_maze_env(
     task: MazeTask, rows: int, seed: int = 0, goal_cell: tuple[int, int] | None = None
 ) -> TransformedEnv:
-    """A TorchRL environment with ``rows`` independent mazes; row by row the episodes depend on the seed alone.
+    """A TorchRL environment with ``rows`` independent mazes.
+
+    Row by row, the start states depend on the seed alone.
 
     Args:
         task (MazeTask): the protocol.
