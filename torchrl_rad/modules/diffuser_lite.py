@@ -50,7 +50,8 @@ def plan_levels(horizon: int, jumps: Sequence[int]) -> list[Level]:
     if horizon < 2:
         raise ValueError(f"horizon is {horizon}; a plan has 2 states or more.")
     spans = [horizon - 1, *jumps]
-    fits = all(jump >= 1 and span % jump == 0 and span > jump for span, jump in pairwise(spans))
+    fits = all(jump >= 1 and span % jump == 0 for span, jump in pairwise(spans))
+    fits = fits and all(jump > finer for jump, finer in pairwise(jumps))
     if not jumps or jumps[-1] != 1 or not fits:
         raise ValueError(
             f"jumps {list(jumps)} do not multiply out to horizon {horizon}: horizon - 1 must be a "
@@ -172,6 +173,12 @@ class DiffuserLitePlanner(TensorDictModuleBase):
             raise ValueError(
                 f"candidates is {candidates}: expected 1, or more and a return_model to rank them."
             )
+        levels = plan_levels(horizon, jumps)
+        if return_model is not None and return_model.tokens != levels[0].tokens:
+            raise ValueError(
+                f"the return model sees {return_model.tokens} states; the first level of these "
+                f"plans has {levels[0].tokens}."
+            )
         if noise not in ("sample", "seeded", "zero"):
             raise ValueError(f"noise is {noise!r}; expected 'sample', 'seeded' or 'zero'.")
         if temperature < 0:
@@ -179,8 +186,7 @@ class DiffuserLitePlanner(TensorDictModuleBase):
         read = ["observation", "target", "found", "target_step", "target_index"]
         self.in_keys = list(in_keys) if in_keys is not None else read if targets else read[:1]
         self.out_keys = list(out_keys)
-        self.levels = plan_levels(horizon, jumps)
-        self.horizon, self.targets = horizon, targets
+        self.levels, self.horizon, self.targets = levels, horizon, targets
         self.process, self.steps, self.temperature = make_process(process), steps, temperature
         self.candidates, self.noise = candidates, noise
         self.placement = TargetPlacement(placement)
@@ -197,29 +203,27 @@ class DiffuserLitePlanner(TensorDictModuleBase):
     @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes plan and action into ``tensordict`` and returns it."""
-        observation = tensordict.get(self.in_keys[0])
-        if observation is None:
-            raise KeyError(f"{self.in_keys[0]!r} is missing in the tensordict: a planner reads it.")
+        observation = self.normalizer.read(tensordict, self.in_keys[0])
         shape, width = observation.shape[:-1], observation.shape[-1]
-        if width != len(self.normalizer.mean):
-            raise ValueError(
-                f"{self.in_keys[0]!r} has {width} entries; the planner was built for "
-                f"{len(self.normalizer.mean)}."
-            )
-        state = torch.nan_to_num(observation, nan=0.0, posinf=0.0, neginf=0.0).float()
-        state = state.reshape(-1, width)
+        state = torch.nan_to_num(observation, nan=0.0, posinf=0.0, neginf=0.0).reshape(-1, width)
         pins = self._pins(tensordict, len(state)) if self.targets else [None] * len(self.levels)
         plan = self.plan(state, pins)
         action = self.inverse_dynamics(state, plan[:, 1])
         tensordict.set(self.out_keys[0], plan.reshape(*shape, *plan.shape[1:]))
-        tensordict.set(self.out_keys[1], action.reshape(*shape, -1))
+        tensordict.set(self.out_keys[1], action.reshape(*shape, action.shape[-1]))
         return tensordict
 
     # what is known
 
     def _pins(self, tensordict: TensorDictBase, rows: int) -> list[Pin | None]:
-        target, found, step = (tensordict.get(key) for key in self.in_keys[1:4])
-        target = target.reshape(rows, -1).float()
+        target = self.normalizer.read(tensordict, self.in_keys[1])
+        target = target.reshape(rows, target.shape[-1])
+        found, step = (tensordict.get(key, None) for key in self.in_keys[2:4])
+        if found is None or step is None:
+            raise KeyError(
+                f"{self.in_keys[2 if found is None else 3]!r} is missing in the tensordict; a "
+                "planner with targets reads it."
+            )
         found, step = found.reshape(rows), step.reshape(rows)
         index = tensordict.get(self.in_keys[4], None) if len(self.in_keys) > 4 else None
         pins: list[Pin | None] = []
@@ -241,7 +245,8 @@ class DiffuserLitePlanner(TensorDictModuleBase):
         shift = shift.to(database.device)
         place = place + shift.maximum(-rows["step"][place]).minimum(rows["remaining"][place])
         recorded = rows[database.sampler.key][place].to(target)
-        return torch.where(index[:, None] >= 0, recorded, target)
+        elsewhere = (index >= 0) & (shift != 0).to(index.device)
+        return torch.where(elsewhere[:, None], recorded, target)
 
     # the plan
 

@@ -18,6 +18,15 @@ def sinusoids(positions: Tensor, size: int) -> Tensor:
     return torch.cat([angles.sin(), angles.cos()], -1)
 
 
+def attend(qkv: Tensor) -> Tensor:
+    """Attention over queries, keys and values in one, [3, B, heads, L, E]: [B, heads, L, E]."""
+    if qkv.dtype != torch.bfloat16 or not qkv.is_cpu:
+        return F.scaled_dot_product_attention(*qkv)
+    # with so few tokens the CPU's fused kernel is slower in bfloat16 than in float32
+    with torch.autocast("cpu", enabled=False):
+        return F.scaled_dot_product_attention(*qkv.float()).to(qkv.dtype)
+
+
 class Block(nn.Module):
     """Attention and MLP, each scaled, shifted and gated by the conditioning (adaLN-Zero)."""
 
@@ -40,8 +49,8 @@ class Block(nn.Module):
 
     def _attention(self, x: Tensor) -> Tensor:
         qkv = self.qkv(x).unflatten(-1, (3, self.heads, -1))
-        qkv = qkv.permute(2, 0, 3, 1, 4)  # [3, B, heads, L, W / heads]
-        return self.out(F.scaled_dot_product_attention(*qkv).transpose(1, 2).flatten(-2))
+        mixed = attend(qkv.permute(2, 0, 3, 1, 4))  # [B, heads, L, W / heads]
+        return self.out(mixed.transpose(1, 2).flatten(-2))
 
 
 class DiT(nn.Module):
@@ -78,8 +87,10 @@ class DiT(nn.Module):
         mask_channel: bool = True,
     ):
         super().__init__()
-        if width % heads:
-            raise ValueError(f"width {width} is not a multiple of heads {heads}.")
+        if width % heads or width % 2 or width < 4:
+            raise ValueError(
+                f"width is {width}; expected an even multiple of heads ({heads}), 4 or more."
+            )
         self.width, self.mask_channel = width, mask_channel
         self.register_buffer("positions", sinusoids(torch.arange(float(tokens)), width))
         self.embed = nn.Linear(state_dim + mask_channel, width)
@@ -112,7 +123,8 @@ class DiT(nn.Module):
         if self.mask_channel:
             x = torch.cat([x, mask.to(x.dtype)], -1)
         x = self.embed(x) + self.positions  # [B, n, W]
-        condition = self.time(sinusoids(1000.0 * time, self.width))  # [B or 1, W]
+        codes = sinusoids(1000.0 * time, self.width)
+        condition = self.time(codes.to(self.positions.dtype))  # [B or 1, W]
         for block in self.blocks:
             x = block(x, condition)
         shift, scale = self.modulation(condition)[:, None].chunk(2, -1)

@@ -37,6 +37,9 @@ class TargetPlacement:
       each such level. The plan is then told to be there at another time than it can be (the paper
       read literally).
 
+    A step below 1 counts as one at the first grid point; one beyond a level's span is not pinned
+    there, and one beyond the horizon nowhere.
+
     Args:
         name (str): one of the above.
 

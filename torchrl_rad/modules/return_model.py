@@ -31,7 +31,7 @@ class ReturnModel(nn.Module):
 
     def __init__(self, normalizer: Normalizer, tokens: int, width: int = 256):
         super().__init__()
-        self.normalizer = normalizer
+        self.normalizer, self.tokens = normalizer, tokens
         self.net = nn.Sequential(
             nn.Linear(tokens * len(normalizer.mean), width), nn.SiLU(),
             nn.Linear(width, width), nn.SiLU(),
@@ -41,9 +41,15 @@ class ReturnModel(nn.Module):
         self.register_buffer("deviation", torch.ones(()))
 
     def fit_scale(self, returns: Tensor) -> ReturnModel:
-        """Takes mean and deviation of recorded returns as the unit of the network's output."""
+        """Takes mean and deviation of recorded returns as the unit of the network's output.
+
+        Raises:
+            ValueError: there are none, or they hold NaN or Inf.
+        """
+        if returns.numel() == 0 or not returns.isfinite().all():
+            raise ValueError(f"expected finite returns, got {returns.numel()} with NaN or Inf.")
         self.mean.fill_(float(returns.mean()))
-        self.deviation.fill_(max(float(returns.std()), 1e-6))
+        self.deviation.fill_(max(float(returns.std(correction=0)), 1e-6))
         return self
 
     def standardised(self, states: Tensor) -> Tensor:

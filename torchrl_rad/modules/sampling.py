@@ -41,6 +41,9 @@ def sample_plan(
     Returns:
         Plans, [B, L, D].
 
+    Raises:
+        ValueError: fewer than one step.
+
     Examples:
         >>> from torchrl_rad.modules.process import RectifiedFlow
         >>> noise = torch.zeros(1, 3, 1)
@@ -49,6 +52,8 @@ def sample_plan(
         >>> sample_plan(RectifiedFlow(), network, noise, known, mask, steps=1).squeeze()
         tensor([1., 2., 2.])
     """
+    if steps < 1:
+        raise ValueError(f"steps is {steps}; a plan needs at least one inference step.")
     sample = inpaint(noise, known, mask)
     grid = process.grid(steps)
     for time, following in zip(grid[:-1], grid[1:], strict=True):

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import Literal
 
 import torch
+import torch.nn.functional as F
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase, dispatch
 from tensordict.utils import NestedKey
@@ -98,13 +99,18 @@ class StepEstimator(TensorDictModuleBase):
         """Writes the estimated steps into ``tensordict`` and returns it."""
         recorded = self.estimate == "recorded"
         if recorded:
-            step = tensordict.get(self.in_keys[2]).clamp(1, self.horizon - 1)
-            tensordict.set(self.out_keys[0], step)
+            offset = tensordict.get(self.in_keys[2], None)
+            if offset is None:
+                raise KeyError(
+                    f"{self.in_keys[2]!r} is missing in the tensordict; estimate='recorded' reads "
+                    "it: RetrievalTargetModule writes it where it is its sixth out_key."
+                )
+            tensordict.set(self.out_keys[0], offset.clamp(1, self.horizon - 1))
         if not recorded or len(self.out_keys) > 1:
             # a state with NaN has itself, without them, as its target
-            state = tensordict.get(self.in_keys[0])
+            state = self.normalizer.read(tensordict, self.in_keys[0])
             state = torch.nan_to_num(state, nan=0.0, posinf=0.0, neginf=0.0)
-            logits = self.logits(state, tensordict.get(self.in_keys[1]))
+            logits = self.logits(state, self.normalizer.read(tensordict, self.in_keys[1]))
             if not recorded:
                 tensordict.set(self.out_keys[0], self._steps(logits))
             if len(self.out_keys) > 1:
@@ -112,10 +118,11 @@ class StepEstimator(TensorDictModuleBase):
         return tensordict
 
     def _steps(self, logits: Tensor) -> Tensor:
-        if self.estimate == "mode":
+        if self.estimate in ("mode", "recorded"):
             return logits.argmax(-1, keepdim=True) + 1
-        weights = logits.softmax(-1) if self.activation == "softmax" else logits.sigmoid()
-        weights = weights / weights.sum(-1, keepdim=True)
+        # sigmoids divided by their sum, also where all of them underflow
+        scores = logits if self.activation == "softmax" else F.logsigmoid(logits)
+        weights = scores.softmax(-1)
         if self.estimate == "median":
             below = (weights.cumsum(-1) < 0.5).sum(-1, keepdim=True)
             return (below + 1).clamp_max(self.horizon - 1)

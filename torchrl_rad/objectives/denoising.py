@@ -124,7 +124,7 @@ class DenoisingLoss(LossModule):
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Loss of a batch of windows, and the mean of each level."""
-        windows = tensordict.get(self.tensor_keys.observation)
+        windows = self.planner_normalizer.read(tensordict, self.tensor_keys.observation)
         if windows.ndim < 2 or windows.shape[-2] != self.horizon:
             raise ValueError(
                 f"{self.tensor_keys.observation!r} is {tuple(windows.shape)}; expected windows "
@@ -151,7 +151,8 @@ class DenoisingLoss(LossModule):
         time = torch.rand(len(clean), device=clean.device)
         noise = torch.randn_like(clean)
         noisy = torch.where(mask, clean, self.process.corrupt(clean, noise, time[:, None, None]))
-        error = self.network(number, noisy, mask, time).float() - self.process.target(clean, noise)
+        predicted = self.network(number, noisy, mask, time).to(clean.dtype)
+        error = predicted - self.process.target(clean, noise)
         weight = torch.ones(clean.shape[1], device=clean.device)
         weight[1] = self.next_weight
         error = torch.where(mask, 0.0, error.square()) * weight[:, None]

@@ -51,7 +51,7 @@ class ReturnGuidanceLoss(LossModule):
         return_model (ReturnModel): J.
 
     Keyword Args:
-        jump (int): step of the grid on which J sees a window.
+        jump (int): step of the grid on which J sees a window: the planner's first jump.
         gamma (float, optional): discount. Defaults to ``0.99``.
         reduction (str, optional): ``"none"``, ``"mean"`` or ``"sum"`` over windows. Defaults to
             ``"mean"``.
@@ -99,6 +99,8 @@ class ReturnGuidanceLoss(LossModule):
         reduction: Literal["none", "mean", "sum"] | None = None,
     ):
         super().__init__()
+        if jump < 1:
+            raise ValueError(f"jump is {jump}; expected 1 or more.")
         self._in_keys: list[NestedKey] | None = None
         self.convert_to_functional(return_model, "return_model")
         self.jump, self.gamma = jump, gamma
@@ -122,10 +124,17 @@ class ReturnGuidanceLoss(LossModule):
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Loss of a batch of windows, and the mean absolute error in units of return."""
-        states = tensordict.get(self.tensor_keys.observation)
+        horizon = self.jump * (self.return_model.tokens - 1) + 1
+        with self.return_model_params.to_module(self.return_model):
+            states = self.return_model.normalizer.read(tensordict, self.tensor_keys.observation)
+        if states.ndim < 2 or states.shape[-2] != horizon:
+            raise ValueError(
+                f"{self.tensor_keys.observation!r} is {tuple(states.shape)}; expected windows "
+                f"[*B, {horizon}, S]: {self.return_model.tokens} states, {self.jump} steps apart."
+            )
         shape = states.shape[:-2]
-        reward = tensordict.get(self.tensor_keys.reward).reshape(*shape, -1)
-        value = tensordict.get(self.tensor_keys.value).reshape(*shape, -1)[..., -1]
+        reward = tensordict[self.tensor_keys.reward].reshape(*shape, horizon)
+        value = tensordict[self.tensor_keys.value].reshape(*shape, horizon)[..., -1]
         masks, counted = window_masks(self._loss_mask_keys(), tensordict, shape)
         target = plan_return(reward, value, self.gamma)
         if counted is not None:  # what is masked may be NaN, also in the backward pass

@@ -121,10 +121,11 @@ class StepEstimationLoss(LossModule):
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Loss of a batch of pairs, and the mean absolute error in steps."""
-        state = tensordict.get(self.tensor_keys.observation)
-        target = tensordict.get(self.tensor_keys.target)
-        step = tensordict.get(self.tensor_keys.target_step)
+        with self.estimator_params.to_module(self.estimator):
+            state = self.estimator.normalizer.read(tensordict, self.tensor_keys.observation)
+            target = self.estimator.normalizer.read(tensordict, self.tensor_keys.target)
         shape = state.shape[:-1]
+        step = tensordict[self.tensor_keys.target_step].reshape(*shape, 1)
         masks, counted = window_masks(self._loss_mask_keys(), tensordict, shape)
         if counted is not None:  # what is masked may be NaN, also in the backward pass
             state = torch.where(counted[..., None], state, 0.0)
@@ -145,7 +146,8 @@ class StepEstimationLoss(LossModule):
         """Loss of each pair [*B]; ``label`` counts from 0."""
         label = label.clamp(0, logits.shape[-1] - 1)
         if self.estimator.activation == "softmax":
-            loss = F.cross_entropy(logits.flatten(0, -2), label.flatten(), reduction="none")
+            scores = logits.reshape(-1, logits.shape[-1])
+            loss = F.cross_entropy(scores, label.flatten(), reduction="none")
             return loss.reshape(label.shape)
         one_hot = F.one_hot(label, logits.shape[-1]).to(logits.dtype)
         return F.binary_cross_entropy_with_logits(logits, one_hot, reduction="none").sum(-1)
