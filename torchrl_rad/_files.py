@@ -206,14 +206,18 @@ def _verify_file(path: Path, size: int, digest: str) -> None:
 
 
 @contextmanager
-def staged_folder(target: str | Path) -> Iterator[Path]:
+def staged_folder(target: str | Path, replace: bool = False) -> Iterator[Path]:
     """A folder to write in; it appears as ``target``, with its manifest, once all is on the disk.
 
     Args:
-        target (path): must not exist yet, so that at no instant the name is a half-written folder.
+        target (path): at no instant the name is a half-written folder.
+        replace (bool, optional): an older folder of this name is moved aside when the new one is
+            whole, then removed; a kill between leaves it beside, under a hidden name. Defaults to
+            ``False``: it must not exist.
 
     Raises:
-        OSError: it cannot be written, or ``target`` exists; what was written is removed.
+        OSError: it cannot be written, or ``target`` exists; what was written is removed and what
+            was there is as it was.
 
     Examples:
         >>> import tempfile
@@ -224,15 +228,22 @@ def staged_folder(target: str | Path) -> Iterator[Path]:
         ['config.json']
     """
     target = Path(target).absolute()
-    if target.exists():
+    if target.exists() and not (replace and target.is_dir()):
         raise FileExistsError(errno.EEXIST, "a file or folder of this name exists", str(target))
+    old = target.parent / f"{STAGE}{target.name}-{uuid.uuid4().hex}"
     stage = target.parent / f"{STAGE}{target.name}-{uuid.uuid4().hex}"
     try:
         stage.mkdir(parents=True)
         yield stage
         write_manifest(stage)
+        if target.exists():
+            os.replace(target, old)
         os.replace(stage, target)
     except BaseException:
+        if old.exists():
+            os.replace(old, target)
         shutil.rmtree(stage, ignore_errors=True)
         raise
     sync(target.parent)
+    if old.exists():
+        shutil.rmtree(old, ignore_errors=True)

@@ -27,8 +27,8 @@ def evaluate(
 ) -> TensorDict:
     """Lets a policy act for one episode in each row of a batched environment.
 
-    Each row counts once, whatever the length of its episode: collecting a fixed number of finished episodes would favour
-    short ones. A row that has ended waits for the others.
+    Each row counts once, whatever the length of its episode: collecting a fixed number of finished
+    episodes would favour short ones. A row that has ended waits for the others.
 
     Args:
         env (EnvBase): [n] rows, seeded.
@@ -37,8 +37,8 @@ def evaluate(
         progress (callable, optional): called after each step.
 
     Returns:
-        TensorDict [n, T] with ``observation``, what TS and SE wrote, and under ``"next"`` ``observation``, ``reward``,
-        ``done``. Steps after a row's end have ``done`` True.
+        TensorDict [n, T] with ``observation``, what TS and SE wrote, and under ``"next"``
+        ``observation``, ``reward``, ``done``. Steps after a row's end have ``done`` True.
 
     Examples:
         >>> from torchrl.envs import GymEnv, SerialEnv
@@ -73,14 +73,16 @@ def episode_results(steps: TensorDictBase) -> dict[str, np.ndarray]:
         steps (TensorDictBase): [n, T] of :func:`evaluate`.
 
     Returns:
-        Arrays [n]: ``return``; ``length``; ``success`` (a positive reward was earned); ``arrival`` (the step of the first
-        one, NaN if none); ``share`` (of the steps from there on that earned one, NaN if none); ``found`` and
-        ``similarity`` (means over steps, where the policy retrieves).
+        Arrays [n]: ``return``; ``length``; ``success`` (a positive reward was earned); ``arrival``
+        (the step of the first one, NaN if none); ``share`` (of the steps from there on that earned
+        one, NaN if none); ``found`` and ``similarity`` (means over steps, where the policy
+        retrieves).
 
     Examples:
         >>> reward = torch.tensor([[0.0, 1.0, 0.0, 1.0, 5.0]]).unsqueeze(-1)
         >>> done = torch.tensor([[False, False, False, True, True]]).unsqueeze(-1)
-        >>> results = episode_results(TensorDict({"next": {"reward": reward, "done": done}}, [1, 5]))
+        >>> steps = TensorDict({"next": {"reward": reward, "done": done}}, [1, 5])
+        >>> results = episode_results(steps)
         >>> [float(results[key][0].round(2)) for key in ("return", "length", "arrival", "share")]
         [2.0, 4.0, 2.0, 0.67]
     """
@@ -109,7 +111,9 @@ def episode_results(steps: TensorDictBase) -> dict[str, np.ndarray]:
 
 
 def interval(values: Sequence[float] | np.ndarray, level: float = 0.95) -> tuple[float, float]:
-    """Mean and half width of its Student t interval; NaN entries do not count, one entry has no interval (NaN).
+    """Mean and half width of its Student t interval, NaN for less than two entries.
+
+    NaN entries do not count.
 
     Examples:
         >>> mean, half = interval([1.0, 2.0, 3.0])
@@ -124,7 +128,9 @@ def interval(values: Sequence[float] | np.ndarray, level: float = 0.95) -> tuple
     return float(kept.mean()), float(half)
 
 
-def summarise(results: dict[str, np.ndarray], score: Callable[[np.ndarray], np.ndarray]) -> dict[str, float]:
+def summarise(
+    results: dict[str, np.ndarray], score: Callable[[np.ndarray], np.ndarray]
+) -> dict[str, float]:
     """Figures of a table row: means over episodes, the score with its 95 % interval.
 
     Args:
@@ -146,7 +152,8 @@ def measure_latency(
 
     Args:
         policy (TensorDictSequential): TS, SE and PL, or PL alone.
-        states (Tensor): [n, T, S], episodes that the policy drove; consecutive ones are asked for, as in acting.
+        states (Tensor): [n, T, S], episodes that the policy drove; consecutive ones are asked for,
+            as in acting.
         rows (int): states of a call, at most n.
         calls (int, optional): timed calls, after five that are not. Defaults to ``50``.
 

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from tensordict import TensorDictBase
 from tensordict.nn import TensorDictSequential
 
 from torchrl_rad.checkpoint import (
@@ -13,10 +14,10 @@ from torchrl_rad.checkpoint import (
     load_weights,
     read_json,
     save_weights,
+    staged_folder,
     state_digest,
     verify_manifest,
     write_json,
-    write_manifest,
 )
 from torchrl_rad.data.database import ExpertDatabase
 from torchrl_rad.modules.diffuser_lite import DiffuserLitePlanner
@@ -26,42 +27,88 @@ from torchrl_rad.modules.return_model import ReturnModel
 from torchrl_rad.modules.step import StepEstimator
 from torchrl_rad.modules.target import OUT_KEYS, RetrievalTargetModule
 
-__all__ = ["build_policy", "load_policy", "save_policy"]
+__all__ = ["build_policy", "fit_scales", "load_policy", "save_policy"]
 
 FORMAT = 1
+PLANNER = {"horizon": 129, "jumps": (32, 8, 1), "candidates": 1}  # of DiffuserLitePlanner
 
 
-def build_policy(description: dict[str, Any], database: ExpertDatabase | None = None) -> TensorDictSequential:
-    """A policy with fresh weights: TS, SE and PL, or PL alone where the description has no ``"target"``.
+def build_policy(
+    description: dict[str, Any], database: ExpertDatabase | None = None
+) -> TensorDictSequential:
+    """A policy with fresh weights: TS, SE and PL, or PL alone where there is no ``"target"``.
 
     Args:
-        description (dict): ``state_dim``, ``action_dim``; ``planner``, ``estimator`` and ``target``: arguments of
-            :class:`DiffuserLitePlanner`, :class:`StepEstimator` and :class:`RetrievalTargetModule`.
+        description (dict): ``state_dim``, ``action_dim``; ``planner``, ``estimator`` and
+            ``target``: arguments of :class:`DiffuserLitePlanner`, :class:`StepEstimator` and
+            :class:`RetrievalTargetModule`. One horizon, the planner's, holds for all three.
         database (ExpertDatabase, optional): the demonstrations, needed with a target.
 
     Raises:
-        ValueError: a target is described and there is no database.
+        ValueError: a target is described and there is no database, or its horizon is another one.
 
     Examples:
-        >>> policy = build_policy({"state_dim": 4, "action_dim": 2, "planner": {"width": 32}, "target": None})
+        >>> policy = build_policy({
+        ...     "state_dim": 4, "action_dim": 2, "planner": {"width": 32}, "target": None})
         >>> policy.in_keys, policy.out_keys
         (['observation'], ['plan', 'action'])
     """
-    states, target = Normalizer.identity(description["state_dim"]), description.get("target")
-    difference = Normalizer.identity(description["state_dim"])
+    width, target = description["state_dim"], description.get("target")
+    planner_options = {**PLANNER, **description["planner"]}
+    estimator_options = dict(description.get("estimator") or {})
+    horizon = planner_options["horizon"]
+    for name, options in (("target", target), ("estimator", estimator_options)):
+        other = (options or {}).get("horizon", horizon)
+        if other != horizon:
+            raise ValueError(
+                f"the horizon of {name!r} is {other}, but the planner was built for {horizon}; "
+                "leave it out, so that the planner's holds."
+            )
+    states, difference = Normalizer.identity(width), Normalizer.identity(width)
     inverse = InverseDynamics(states, difference, description["action_dim"])
-    options = dict(description["planner"])
-    horizon, jumps = options.get("horizon", 129), options.get("jumps", (32, 8, 1))
-    if options.get("candidates", 1) > 1:
-        options["return_model"] = ReturnModel(states, tokens=(horizon - 1) // jumps[0] + 1)
-    planner = DiffuserLitePlanner(states, inverse, targets=target is not None, database=database, **options)
+    if planner_options["candidates"] > 1:
+        tokens = (horizon - 1) // planner_options["jumps"][0] + 1
+        planner_options["return_model"] = ReturnModel(states, tokens)
+    planner = DiffuserLitePlanner(
+        states, inverse, targets=target is not None, database=database, **planner_options
+    )
     if target is None:
         return TensorDictSequential(planner)
     if database is None:
         raise ValueError("this policy retrieves targets: pass the database.")
-    select = RetrievalTargetModule(database, horizon, **target, out_keys=[*OUT_KEYS, "target_offset"])
-    estimator = StepEstimator(states, horizon, **description.get("estimator", {}))
+    select = RetrievalTargetModule(
+        database, out_keys=[*OUT_KEYS, "target_offset"], **{"horizon": horizon, **target}
+    )
+    estimator = StepEstimator(states, **{"horizon": horizon, **estimator_options})
     return TensorDictSequential(select, estimator, planner)
+
+
+def fit_scales(policy: TensorDictSequential, data: TensorDictBase) -> None:
+    """Takes over the scales of recorded data: of states, their change in a step, and of returns.
+
+    Args:
+        policy (TensorDictSequential): of :func:`build_policy`; changed in place.
+        data (TensorDictBase): flat steps [T] with ``observation``, ``("next", "observation")`` and
+            ``return_to_go`` [T].
+
+    Raises:
+        ValueError: the states hold NaN or Inf, or have another width.
+    """
+    planner = policy[-1]
+    now, following = data["observation"], data["next", "observation"]
+    planner.normalizer.load_state_dict(_scale(now, planner.normalizer))
+    change = planner.inverse_dynamics.difference
+    change.load_state_dict(_scale(following - now, change))
+    if planner.return_model is not None:
+        planner.return_model.fit_scale(data["return_to_go"])
+
+
+def _scale(values, like: Normalizer) -> dict[str, Any]:
+    if values.shape[-1] != len(like.mean):
+        raise ValueError(
+            f"the states have {values.shape[-1]} entries; the policy was built for {len(like.mean)}"
+        )
+    return Normalizer.of(values).state_dict()
 
 
 def save_policy(
@@ -70,26 +117,35 @@ def save_policy(
     description: dict[str, Any],
     database: ExpertDatabase | None = None,
 ) -> None:
-    """Saves a policy: ``policy.json``, ``weights.safetensors``, ``database/`` and a manifest with the sha256 of each.
+    """Saves a policy: description, weights and database, with the sha256 of each file.
+
+    The folder holds ``policy.json``, ``weights.safetensors``, ``database/`` and
+    ``manifest.json``; it appears only when it is complete, in place of an older one.
 
     Args:
-        folder (path): made if need be.
+        folder (path): parents are made if need be.
         policy (TensorDictSequential): built by :func:`build_policy` with this description.
         description (dict): see there; further entries are kept.
         database (ExpertDatabase, optional): saved beside the weights.
+
+    Raises:
+        CheckpointError: the disk is full or the folder cannot be written.
     """
-    folder = Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
-    save_weights(folder, "weights", policy)
+    try:
+        with staged_folder(folder, replace=True) as stage:
+            save_weights(stage, "weights", policy)
+            if database is not None:
+                database.dumps(stage / "database")
+            about = {
+                "format": FORMAT,
+                "database": None if database is None else database.digest(),
+                "normalizer": state_digest(policy[-1].normalizer.state_dict()),
+            }
+            write_json(stage / "policy.json", {**description, **about})
+    except OSError as error:
+        raise CheckpointError(f"the policy was not saved in {folder}: {error}.") from error
     if database is not None:
-        database.dumps(folder / "database")
-    digest = None if database is None else database.digest()
-    normalizer = state_digest(policy.module[-1].normalizer.state_dict())
-    write_json(
-        folder / "policy.json",
-        {**description, "format": FORMAT, "database": digest, "normalizer": normalizer},
-    )
-    write_manifest(folder)
+        database.path = Path(folder).absolute() / "database"  # no longer in the stage
 
 
 def load_policy(
@@ -99,25 +155,38 @@ def load_policy(
 
     Args:
         folder (path): written by :func:`save_policy`.
-        database (ExpertDatabase, optional): used in place of the saved one, on purpose: other rows, other behaviour.
+        database (ExpertDatabase, optional): used in place of the saved one, on purpose: other rows,
+            other behaviour.
         device (str, optional): of the networks. Defaults to ``"cpu"``.
 
     Raises:
         FileNotFoundError: the folder holds no policy.
-        CheckpointError: a file is damaged, cut short or missing, or the database is not the one that was saved.
+        CheckpointError: a file is damaged, cut short or missing, the folder is of another version,
+            or the database or the normaliser is not the one that was saved.
     """
     folder = Path(folder)
     if not (folder / "policy.json").exists():
-        raise FileNotFoundError(f"{folder} holds no policy: policy.json is missing. Pass a folder that save_policy wrote.")
+        raise FileNotFoundError(
+            f"{folder} holds no policy: policy.json is missing. "
+            "Pass a folder that save_policy wrote, such as <run folder>/policies/followed."
+        )
     verify_manifest(folder)
     description = read_json(folder / "policy.json")
+    if description.get("format") != FORMAT:
+        raise CheckpointError(
+            f"{folder} has the format {description.get('format')}; this version of torchrl_rad "
+            f"reads {FORMAT}. Load it with the version that saved it."
+        )
     if database is None and description["database"] is not None:
         database = ExpertDatabase.loads(folder / "database")
         if database.digest() != description["database"]:
             raise CheckpointError(
-                f"{folder / 'database'} is not the database that this policy was saved with (sha256 differs); "
-                "restore it, or pass another one on purpose: load_policy(folder, database=...)."
+                f"{folder / 'database'} is not the database that this policy was saved with "
+                "(sha256 differs); restore it, or pass another one on purpose: "
+                "load_policy(folder, database=...)."
             )
     policy = build_policy(description, database)
     load_weights(folder, "weights", policy)
+    if state_digest(policy[-1].normalizer.state_dict()) != description["normalizer"]:
+        raise CheckpointError(f"the weights in {folder} have another normaliser than policy.json.")
     return policy.to(device).eval()

@@ -1,0 +1,179 @@
+"""DL-RAD on PointMaze: trains, compares with its backbone, prints a table.
+
+python recipes/dl_rad.py task=pointmaze-medium seed=1
+python recipes/dl_rad.py --multirun seed=0,1,2
+python recipes/dl_rad.py resume=outputs/pointmaze-umaze/<run>
+"""
+
+from __future__ import annotations
+
+import datetime
+import sys
+from typing import Any
+
+import hydra
+import torch
+from omegaconf import DictConfig, OmegaConf
+from torchrl.objectives import BCLoss
+
+from torchrl_rad import (
+    DenoisingLoss,
+    ReturnGuidanceLoss,
+    StepEstimationLoss,
+    draw_step_pairs,
+    inverse_dynamics_actor,
+)
+from torchrl_rad.checkpoint import Checkpointer, CheckpointError, state_digest
+from torchrl_rad.experiment import (
+    BACKBONE,
+    PolicyParts,
+    check_data,
+    evaluate_policies,
+    make_data,
+    make_logger,
+    make_policies,
+    share_weights,
+    window_sampler,
+)
+from torchrl_rad.plots import plot_curves, plot_targets
+from torchrl_rad.policy import save_policy
+from torchrl_rad.results import SCORE_SOURCE, format_table
+from torchrl_rad.runs import RunFolder
+from torchrl_rad.training import Interrupted, Objective, bf16_wins, train
+
+ERRORS = (CheckpointError, FileNotFoundError, FloatingPointError, KeyError, ValueError)
+
+
+def make_objectives(cfg: dict[str, Any], policies: dict[str, PolicyParts], trained: str):
+    """L_d, L_e, L_g and behaviour cloning of the inverse dynamics; L_d again for the backbone."""
+    _, estimator, planner = policies[trained].policy
+    backbone = policies[BACKBONE].policy[-1]
+    optim, network, loss = cfg["optim"], cfg["network"], cfg["loss"]
+    steps, head = optim["gradient_steps"], {"lr": optim["head_lr"], "warmup": optim["warmup"]}
+    bf16 = {"auto": bf16_wins(cfg["device"]), "bf16": True, "fp32": False}[optim["precision"]]
+
+    def denoising(planner) -> Objective:
+        module = DenoisingLoss(
+            planner, no_target=loss["no_target"], next_weight=loss["next_weight"], delay=True
+        )
+        names = ("lr", "warmup", "weight_decay", "ema")
+        options = {name: optim[name] for name in names}
+        select = lambda windows: windows.select("observation")  # noqa: E731
+        return Objective(module, select, steps=steps, bf16=bf16, **options)
+
+    objectives = {
+        "planner": denoising(planner),
+        BACKBONE: denoising(backbone),
+        "estimator": Objective(
+            StepEstimationLoss(estimator),
+            lambda windows: draw_step_pairs(windows["observation"]),
+            steps=steps,
+            **head,
+        ),
+        "inverse": Objective(
+            BCLoss(inverse_dynamics_actor(planner.inverse_dynamics), loss_function="l2"),
+            lambda windows: windows[:, :8].reshape(-1),  # enough of them; all would cost more
+            steps=steps,
+            **head,
+        ),
+    }
+    if planner.return_model is not None:
+        module = ReturnGuidanceLoss(
+            planner.return_model, jump=network["jumps"][0], gamma=loss["gamma"]
+        )
+        objectives["return"] = Objective(module, lambda windows: windows, steps=steps, **head)
+    return objectives
+
+
+def run_training(run: RunFolder, cfg: dict[str, Any], policies, data, resume: bool) -> None:
+    """Trains, puts the averaged weights into all policies and saves these."""
+    trained = next(name for name in policies if name != BACKBONE)
+    objectives = make_objectives(cfg, policies, trained)
+    logger, settings = make_logger(run, cfg), cfg["logger"]
+    planner = policies[trained].policy[-1]
+    checkpointer = Checkpointer(run.path / "checkpoints")
+    latest = checkpointer.latest() if resume else None
+    run.metrics.rewind(0 if latest is None else int(latest.name.split("-")[1]))
+    torch.manual_seed(cfg["seed"])
+    train(
+        objectives,
+        window_sampler(data, cfg["network"]["horizon"], cfg["replay_buffer"]["batch_size"]),
+        cfg["optim"]["gradient_steps"],
+        checkpointer,
+        save_interval=settings["save_interval"],
+        log_interval=settings["log_interval"],
+        log=logger,
+        meta={
+            "task": cfg["env"]["name"],
+            "normalizer": state_digest(planner.normalizer.state_dict()),
+            "network": cfg["network"],
+        },
+        resume=resume,
+        progress=settings["progress"],
+    )
+    for name in ("planner", BACKBONE):
+        loss = objectives[name].loss
+        loss.network_params.data.update_(loss.target_network_params.data)
+    share_weights(policies, trained)
+    for name, parts in policies.items():
+        about = {"task": cfg["env"]["name"], "maze": cfg["env"]["maze"], "seed": cfg["seed"]}
+        save_policy(
+            run.path / "policies" / name,
+            parts.policy,
+            {**about, **parts.description},
+            parts.database,
+        )
+
+
+def main_run(run: RunFolder, cfg: dict[str, Any], resume: bool) -> None:
+    """The whole of a run, from the data to the table."""
+    torch.set_num_threads(cfg["threads"])
+    torch.manual_seed(cfg["seed"])  # fresh weights are the same when resumed
+    print(f"run folder: {run.path}", flush=True)
+    task, data = make_data(cfg)
+    print(check_data(task, data), flush=True)
+    network = dict(cfg["network"])
+    step_width = network.pop("step_width")
+    policies = make_policies(network, cfg["retrieval"], data, step_width)
+    for parts in policies.values():
+        parts.policy.to(cfg["device"])
+    for name, parts in policies.items():
+        if parts.database is not None:
+            kept = len(parts.database[:]["episode"].unique())
+            print(f"{name}: {kept} episodes, {len(parts.database)} rows", flush=True)
+    data = data.to(cfg["device"]) if cfg["device"] != "cpu" else data
+    run_training(run, cfg, policies, data, resume)
+    rows, episodes = evaluate_policies(run, cfg, task, policies, data)
+    plot_curves(run.metrics.rows(), run.path / "curves.png")
+    titles = {name: f"{name}: {rows[name]['score']:.0f}" for name in rows}
+    plain = {name: parts.policy for name, parts in policies.items()}
+    plot_targets(task, episodes, plain, titles, run.path / "targets.png")
+    low, high = task.reference_scores
+    print(f"\n{format_table(rows)}\n\n{SCORE_SOURCE.format(low=low, high=high)}", flush=True)
+
+
+@hydra.main(config_path="config", config_name="dl_rad", version_base="1.3")
+def main(config: DictConfig) -> None:
+    """Reads the command line; errors that a user can mend end in one line."""
+    cfg = OmegaConf.to_container(config, resolve=True)
+    try:
+        if cfg["resume"] is not None:
+            run = RunFolder.open(cfg["resume"])
+            resumed = run.config()
+            resumed["logger"]["progress"] = cfg["logger"]["progress"]
+            main_run(run, resumed, resume=True)
+            return
+        date = datetime.datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
+        folder = cfg["folder"] or f"outputs/{cfg['env']['name']}/{date}-seed{cfg['seed']}"
+        run = RunFolder.create(folder, cfg)
+        main_run(run, cfg, resume=False)
+    except Interrupted as stop:
+        print(f"\nstopped and saved at step {stop.args[0]}; go on with:", file=sys.stderr)
+        print(f"python recipes/dl_rad.py resume={run.path}", file=sys.stderr)
+        sys.exit(130)
+    except ERRORS as error:
+        sys.exit(f"error: {error.args[0] if isinstance(error, KeyError) else error}")
+
+
+if __name__ == "__main__":
+    main()

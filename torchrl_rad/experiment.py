@@ -1,0 +1,276 @@
+"""The steps that recipes share: data, databases, policies, evaluation and its table."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictSequential
+from torchrl.data import LazyTensorStorage
+from torchrl.record.loggers import get_logger
+from tqdm import tqdm
+
+from torchrl_rad._files import write_json
+from torchrl_rad.data.database import ExpertDatabase
+from torchrl_rad.data.episodes import episode_lengths, return_to_go
+from torchrl_rad.data.experts import expert_from_config
+from torchrl_rad.data.maze2d import maze_dataset
+from torchrl_rad.data.report import DataReport, report
+from torchrl_rad.data.windows import window_buffer
+from torchrl_rad.envs.maze import FixedGoalMaze, MazeTask, make_maze_env, maze_task
+from torchrl_rad.evaluation import episode_results, evaluate, measure_latency, summarise
+from torchrl_rad.objectives.step import draw_step_pairs
+from torchrl_rad.policy import build_policy, fit_scales
+from torchrl_rad.results import SCORE_SOURCE
+from torchrl_rad.retrieval import RetrievalSampler
+from torchrl_rad.runs import RunFolder, environment_facts
+
+__all__ = [
+    "BACKBONE",
+    "PolicyParts",
+    "check_data",
+    "collect_episodes",
+    "evaluate_policies",
+    "make_data",
+    "make_database",
+    "make_logger",
+    "make_policies",
+    "policy_row",
+    "share_weights",
+    "step_error",
+    "window_sampler",
+]
+
+BACKBONE = "backbone"
+PARTS = {"TS": "RetrievalTargetModule", "SE": "StepEstimator", "PL": "DiffuserLitePlanner"}
+
+
+@dataclass
+class PolicyParts:
+    """A policy with what it takes to save it."""
+
+    policy: TensorDictSequential
+    description: dict[str, Any]
+    database: ExpertDatabase | None = None
+
+
+def make_data(cfg: Mapping[str, Any]) -> tuple[MazeTask, TensorDictBase]:
+    """The task and its recorded steps [T], with ``return_to_go`` at the discount of L_g."""
+    task, source = maze_task(cfg["env"]["maze"]), cfg["replay_buffer"]
+    data = maze_dataset(
+        task,
+        source["dataset"],
+        source["steps"],
+        source["seed"],
+        source["download"],
+        cfg["logger"]["progress"],
+    ).copy()
+    value = return_to_go(data["next", "reward"], episode_lengths(data), cfg["loss"]["gamma"])
+    data["return_to_go"] = value
+    return task, data
+
+
+def check_data(task: MazeTask, data: TensorDictBase) -> DataReport:
+    """A report on the data against the task's start cells.
+
+    Raises:
+        ValueError: it has faults; the message names them.
+    """
+    env = FixedGoalMaze(task)
+    centres = np.stack([env.maze.cell_rowcol_to_xy(cell) for cell in env.reset_cells])
+    env.close()
+    found = report(data, starts=torch.from_numpy(centres).float())
+    if not found.ok:
+        raise ValueError(f"the data cannot be trained on:\n{found}")
+    return found
+
+
+def make_database(data: TensorDictBase, options: Mapping[str, Any]) -> ExpertDatabase:
+    """The demonstrations among recorded steps.
+
+    Args:
+        data (TensorDictBase): flat steps [T].
+        options (mapping): ``expert`` (config of a rule, or None), ``gamma`` and ``sampler``
+            (arguments of :class:`~torchrl_rad.retrieval.RetrievalSampler`).
+
+    Raises:
+        ValueError: the rule keeps no episode.
+    """
+    rule = options.get("expert")
+    database = ExpertDatabase(
+        LazyTensorStorage(len(data)),
+        gamma=options["gamma"],
+        expert=None if rule is None else expert_from_config(rule),
+        sampler=RetrievalSampler(**options["sampler"]),
+    )
+    database.extend(data.exclude("return_to_go"))
+    return database
+
+
+def make_policies(
+    planner: Mapping[str, Any], retrieval: Mapping[str, Any], data: TensorDictBase, step_width: int
+) -> dict[str, PolicyParts]:
+    """The backbone and one policy for each way to retrieve, with fresh weights.
+
+    Args:
+        planner (mapping): arguments of the planner.
+        retrieval (mapping): name -> ``expert``, ``gamma``, ``sampler``, ``target``, ``estimator``.
+        data (TensorDictBase): flat steps [T].
+        step_width (int): width of the step estimator.
+    """
+    sizes = {"state_dim": data["observation"].shape[-1], "action_dim": data["action"].shape[-1]}
+    shared = {**sizes, "planner": dict(planner)}
+    policies = {BACKBONE: PolicyParts(build_policy(shared), shared)}
+    for name, options in retrieval.items():
+        database = make_database(data, options)
+        estimator = {"width": step_width, **options["estimator"]}
+        description = {**shared, "target": dict(options["target"]), "estimator": estimator}
+        policy = build_policy(description, database)
+        policies[name] = PolicyParts(policy, description, database)
+    for parts in policies.values():
+        fit_scales(parts.policy, data)
+    return policies
+
+
+def share_weights(policies: Mapping[str, PolicyParts], trained: str) -> None:
+    """Gives the weights of one policy to all: all of them, or the backbone its heads alone."""
+    source = policies[trained].policy
+    for name, parts in policies.items():
+        if name == BACKBONE:
+            own, given = parts.policy[-1], source[-1]
+            own.inverse_dynamics.load_state_dict(given.inverse_dynamics.state_dict())
+            if own.return_model is not None:
+                own.return_model.load_state_dict(given.return_model.state_dict())
+        elif name != trained:
+            parts.policy.load_state_dict(source.state_dict())
+
+
+def window_sampler(data: TensorDictBase, horizon: int, batch_size: int):
+    """A function that draws windows [batch_size, horizon] of recorded steps."""
+    kept = data.select(
+        "observation", "action", "episode", "return_to_go",
+        ("next", "observation"), ("next", "reward"),
+    )  # fmt: skip
+    buffer = window_buffer(kept, horizon, batch_size)
+    return lambda: buffer.sample().reshape(-1, horizon)
+
+
+def step_error(policy: TensorDictSequential, windows: TensorDictBase) -> float:
+    """Mean absolute error of the step estimator on pairs of recorded states, in steps."""
+    estimator = policy[1]
+    pairs = draw_step_pairs(windows["observation"])
+    with torch.no_grad():
+        steps = estimator._steps(estimator.logits(pairs["observation"], pairs["target"]))
+    return float((steps - pairs["target_step"]).abs().float().mean())
+
+
+def collect_episodes(
+    task: MazeTask,
+    policy: TensorDictSequential,
+    episodes: int,
+    seed: int,
+    name: str = "policy",
+    goal_cell: tuple[int, int] | None = None,
+    progress: bool = True,
+) -> TensorDictBase:
+    """The first episode of each of ``episodes`` rows of the task; same seed, same episodes."""
+    env = make_maze_env(task, episodes, seed, goal_cell)
+    torch.manual_seed(seed)
+    bar = tqdm(total=task.max_steps, desc=f"evaluating {name}", unit="step", disable=not progress)
+    with bar:
+        steps = evaluate(env, policy, task.max_steps, progress=bar.update)
+    env.close()
+    return steps
+
+
+def make_logger(run: RunFolder, cfg: Mapping[str, Any]) -> Callable[[int, dict[str, float]], None]:
+    """Writes ``metrics.csv``, and to TensorBoard or W&B if the config names one of them.
+
+    Raises:
+        ValueError: another backend.
+    """
+    settings = cfg["logger"]
+    backend = settings["backend"]
+    if backend not in ("csv", "tensorboard", "wandb"):
+        raise ValueError(
+            f"logger.backend is {backend!r}; expected 'csv', 'tensorboard' or 'wandb'."
+        )
+    other = None
+    if backend != "csv":
+        options = {"mode": settings["mode"], "project": settings["project_name"], "config": cfg}
+        other = get_logger(
+            backend,
+            logger_name=str(run.path / backend),
+            experiment_name=run.path.name,
+            **({"wandb_kwargs": options} if backend == "wandb" else {}),
+        )
+
+    def log(step: int, values: dict[str, float]) -> None:
+        run.metrics.write(step, values)
+        if other is not None:
+            other.log_metrics(values, step=step)
+
+    return log
+
+
+def evaluate_policies(
+    run: RunFolder,
+    cfg: Mapping[str, Any],
+    task: MazeTask,
+    policies: Mapping[str, PolicyParts],
+    data: TensorDictBase,
+) -> tuple[dict[str, dict[str, Any]], dict[str, TensorDictBase]]:
+    """Scores every policy and writes ``results.json``; what was evaluated before is not done again.
+
+    Returns:
+        Rows for :func:`~torchrl_rad.results.format_table`, and the episodes [n, T] of each policy.
+    """
+    settings, progress = cfg["evaluation"], cfg["logger"]["progress"]
+    torch.manual_seed(settings["seed"])
+    windows = window_sampler(data, cfg["network"]["horizon"], 4096)()
+    rows: dict[str, dict[str, Any]] = {}
+    episodes: dict[str, TensorDictBase] = {}
+    for name, parts in policies.items():
+        steps = run.load_episodes(name)
+        if steps is None:
+            seed = settings["seed"] + cfg["seed"]
+            steps = collect_episodes(
+                task, parts.policy, settings["episodes"], seed, name, progress=progress
+            )
+            run.save_episodes(name, steps)
+        episodes[name] = steps
+        rows[name] = policy_row(task, parts.policy, steps)
+        if name != BACKBONE:
+            recorded = parts.policy[1].estimate == "recorded"
+            rows[name]["step_error"] = None if recorded else step_error(parts.policy, windows)
+    low, high = task.reference_scores
+    about = {"task": cfg["env"]["name"], "seed": cfg["seed"], "data": cfg["replay_buffer"]}
+    source = SCORE_SOURCE.format(low=low, high=high)
+    facts = environment_facts()
+    write_json(run.path / "results.json", {**about, "rows": rows, "score_source": source, **facts})
+    return rows, episodes
+
+
+def policy_row(
+    task: MazeTask, policy: TensorDictSequential, steps: TensorDictBase
+) -> dict[str, Any]:
+    """The figures of one policy: means, each episode's return, and latencies on one thread."""
+    results = episode_results(steps)
+    row: dict[str, Any] = summarise(results, task.normalised_score)
+    row["episode_returns"] = results["return"].tolist()
+    row["episode_scores"] = task.normalised_score(results["return"]).tolist()
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    latency = {}
+    for count in (1, min(50, len(steps))):
+        latency[str(count)] = measure_latency(policy, steps["observation"], count)
+    torch.set_num_threads(threads)
+    row["latency_ms"] = latency
+    for part, module in PARTS.items():
+        if module in latency["1"]:
+            row[part] = "{p50:.1f} / {p95:.1f}".format(**latency["1"][module])
+    return row

@@ -1,0 +1,114 @@
+"""The table of a run, and one table of several runs."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy import stats
+
+from torchrl_rad._files import CheckpointError, read_json
+from torchrl_rad.evaluation import interval
+
+__all__ = ["SCORE_SOURCE", "format_table", "merge_results"]
+
+SCORE_SOURCE = (
+    "score: 100 x (return - min) / (max - min), reference returns {low} and {high} of D4RL's "
+    "maze2d v1 (d4rl/infos.py)"
+)
+COLUMNS = {  # key: (heading, format)
+    "return": ("return", "{:.1f}"),
+    "score": ("score", "{:.1f}"),
+    "interval": ("+- 95 %", "{:.1f}"),
+    "success": ("success", "{:.2f}"),
+    "arrival": ("steps to goal", "{:.0f}"),
+    "share": ("share at goal", "{:.3f}"),
+    "found": ("found", "{:.3f}"),
+    "similarity": ("similarity", "{:.3f}"),
+    "step_error": ("step error", "{:.1f}"),
+    "episodes": ("episodes", "{:.0f}"),
+    "TS": ("TS ms", "{}"),
+    "SE": ("SE ms", "{}"),
+    "PL": ("PL ms", "{}"),
+    "seeds": ("score of each seed", "{}"),
+}
+
+
+def format_table(rows: Mapping[str, Mapping[str, Any]]) -> str:
+    """A Markdown table, one line a policy; columns that no row has are left out.
+
+    Args:
+        rows (mapping): name -> figures, named as in ``COLUMNS``; NaN and None show as a dash.
+
+    Examples:
+        >>> print(format_table({"backbone": {"return": 12.0, "score": float("nan")}}))
+        | policy | return | score |
+        |---|---|---|
+        | backbone | 12.0 | - |
+    """
+    keys = [key for key in COLUMNS if any(key in row for row in rows.values())]
+    lines = [
+        f"| policy | {' | '.join(COLUMNS[key][0] for key in keys)} |",
+        "|---" * (len(keys) + 1) + "|",
+    ]
+    for name, row in rows.items():
+        cells = [_cell(row.get(key), COLUMNS[key][1]) for key in keys]
+        lines.append(f"| {name} | {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+def _cell(value: Any, form: str) -> str:
+    if value is None or (isinstance(value, float) and not np.isfinite(value)):
+        return "-"
+    return form.format(value)
+
+
+def merge_results(folders: Sequence[str | Path]) -> dict[str, dict[str, Any]]:
+    """Rows of several runs of one task, seeds taken together.
+
+    The score is the mean over seeds. Its interval treats episodes as independent given the seed,
+    and adds the spread between seeds: the larger of both 95 % half widths is given.
+
+    Args:
+        folders (sequence of path): run folders with a ``results.json``.
+
+    Returns:
+        name -> figures, for :func:`format_table`.
+
+    Raises:
+        CheckpointError: a folder has no results, or those of another task.
+    """
+    runs = [_read(Path(folder)) for folder in folders]
+    tasks = {run["task"] for run in runs}
+    if len(tasks) != 1:
+        raise CheckpointError(f"these runs are of several tasks, {sorted(tasks)}; merge each.")
+    names = [name for name in runs[0]["rows"] if all(name in run["rows"] for run in runs)]
+    return {name: _merge([run["rows"][name] for run in runs]) for name in names}
+
+
+def _read(folder: Path) -> dict[str, Any]:
+    if not (folder / "results.json").exists():
+        raise CheckpointError(
+            f"{folder} has no results.json; its run failed or is not over (resume={folder})."
+        )
+    return read_json(folder / "results.json")
+
+
+def _merge(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    scores = [row["score"] for row in rows]
+    pooled = np.concatenate([row["episode_scores"] for row in rows])
+    merged = {
+        key: interval([row[key] for row in rows])[0]
+        for key in ("return", "success", "arrival", "share", "found", "similarity", "step_error")
+        if all(row.get(key) is not None for row in rows)
+    }
+    between = stats.sem(scores) * stats.t.ppf(0.975, len(scores) - 1) if len(scores) > 1 else 0.0
+    return {
+        **merged,
+        "score": float(np.mean(scores)),
+        "interval": float(max(interval(pooled)[1], between)),
+        "episodes": len(pooled),
+        "seeds": ", ".join(f"{score:.1f}" for score in scores),
+    }

@@ -1,0 +1,257 @@
+"""Training several objectives side by side, each with its own optimiser, resumable to the bit."""
+
+from __future__ import annotations
+
+import math
+import signal
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+from torch.nn.utils import clip_grad_norm_
+from torch.optim.lr_scheduler import LambdaLR
+from torchrl.checkpoint import GlobalRNGState
+from torchrl.objectives import SoftUpdate
+from torchrl.objectives.common import LossModule
+from tqdm import tqdm
+
+from torchrl_rad.checkpoint import Checkpointer
+
+__all__ = ["Interrupted", "Meter", "Objective", "bf16_wins", "train"]
+
+CLIP = 1.0  # largest norm of a gradient
+
+
+class Interrupted(KeyboardInterrupt):
+    """Training stopped early on request; ``args[0]`` is the last step done, and it is saved.
+
+    Examples:
+        >>> Interrupted(3).args
+        (3,)
+    """
+
+
+@dataclass
+class Objective:
+    """One loss and how it is optimised; objectives share no gradients (RAD, "Model Learning").
+
+    Args:
+        loss (LossModule): its outputs ``loss_*`` are summed and minimised, the others are logged.
+        prepare (callable): windows [B, H] -> what the loss reads.
+        lr (float): of AdamW, after a linear warm-up, falling to 0 along a cosine.
+        steps (int): length of the training.
+        warmup (int, optional): steps of the warm-up. Defaults to ``50``.
+        weight_decay (float, optional): Defaults to ``1e-5``.
+        ema (float, optional): decay of the target parameters; None if the loss has none.
+        bf16 (bool, optional): compute the loss under bfloat16 autocast. Defaults to ``False``.
+
+    Examples:
+        >>> from torchrl_rad import Normalizer, StepEstimationLoss, StepEstimator, draw_step_pairs
+        >>> from tensordict import TensorDict
+        >>> loss = StepEstimationLoss(StepEstimator(Normalizer.identity(2), horizon=9))
+        >>> objective = Objective(
+        ...     loss, lambda windows: draw_step_pairs(windows["observation"]), lr=1e-3, steps=10)
+        >>> sorted(objective.update(TensorDict({"observation": torch.randn(8, 9, 2)}, [8])))
+        ['loss_step', 'step_error']
+    """
+
+    loss: LossModule
+    prepare: Callable[[TensorDictBase], TensorDictBase]
+    lr: float
+    steps: int
+    warmup: int = 50
+    weight_decay: float = 1e-5
+    ema: float | None = None
+    bf16: bool = False
+
+    def __post_init__(self):
+        parameters = list(self.loss.parameters())
+        self.optimizer = torch.optim.AdamW(
+            parameters, lr=self.lr, weight_decay=self.weight_decay, fused=True
+        )
+        self.scheduler = LambdaLR(self.optimizer, self._rate)
+        self.updater = None if self.ema is None else SoftUpdate(self.loss, eps=self.ema)
+
+    def _rate(self, step: int) -> float:
+        warm = min(1.0, (step + 1) / max(1, self.warmup))
+        return warm * 0.5 * (1.0 + math.cos(math.pi * min(1.0, step / self.steps)))
+
+    def update(self, windows: TensorDictBase) -> dict[str, Tensor]:
+        """One step of the optimiser; gives the loss's outputs, detached.
+
+        Raises:
+            FloatingPointError: the loss is NaN or Inf.
+        """
+        batch = self.prepare(windows)
+        with torch.autocast(windows["observation"].device.type, torch.bfloat16, self.bf16):
+            out = self.loss(batch)
+        total = sum(out[key] for key in out.keys() if key.startswith("loss_"))
+        if not total.isfinite():
+            raise FloatingPointError(f"{type(self.loss).__name__} gave {total.item()}.")
+        self.optimizer.zero_grad()
+        total.backward()
+        clip_grad_norm_(self.loss.parameters(), CLIP)
+        self.optimizer.step()
+        self.scheduler.step()
+        if self.updater is not None:
+            self.updater.step()
+        return {key: value.detach() for key, value in out.items()}
+
+    def components(self, name: str) -> dict[str, Any]:
+        """What a checkpoint holds of it."""
+        return {
+            f"{name}.loss": self.loss,
+            f"{name}.optimizer": self.optimizer,
+            f"{name}.scheduler": self.scheduler,
+        }
+
+
+class Meter:
+    """Means of named values since the last call of :meth:`read`.
+
+    Examples:
+        >>> meter = Meter()
+        >>> meter.add({"loss": torch.tensor(1.0)})
+        >>> meter.add({"loss": torch.tensor(2.0)})
+        >>> meter.read()
+        {'loss': 1.5}
+    """
+
+    def __init__(self) -> None:
+        self.sums: dict[str, float] = {}
+        self.count = 0
+
+    def add(self, values: Mapping[str, Tensor]) -> None:
+        """Adds one value of each name."""
+        for key, value in values.items():
+            self.sums[key] = self.sums.get(key, 0.0) + float(value)
+        self.count += 1
+
+    def read(self) -> dict[str, float]:
+        """The means, and begins anew."""
+        means = {key: total / self.count for key, total in self.sums.items()}
+        self.sums, self.count = {}, 0
+        return means
+
+    def state_dict(self) -> dict[str, Any]:
+        return {"sums": self.sums, "count": self.count}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        self.sums, self.count = dict(state["sums"]), state["count"]
+
+
+def bf16_wins(device: str | torch.device) -> bool:
+    """Whether products of bfloat16 matrices are faster than of float32: CUDA, or a CPU with AMX."""
+    if torch.device(device).type == "cuda":
+        return torch.cuda.is_bf16_supported()
+    supported = getattr(torch.cpu, "_is_amx_tile_supported", None)
+    return bool(supported and supported())
+
+
+def train(
+    objectives: Mapping[str, Objective],
+    sample: Callable[[], TensorDictBase],
+    steps: int,
+    checkpointer: Checkpointer,
+    save_interval: int,
+    log_interval: int,
+    log: Callable[[int, dict[str, float]], None],
+    meta: Mapping[str, Any],
+    resume: bool = False,
+    progress: bool = True,
+) -> int:
+    """Trains all objectives on the same windows, saving at intervals, on Ctrl-C and on SIGTERM.
+
+    A resumed training draws the same batches and noise as one that was never interrupted: on a CPU
+    the losses are equal to the bit.
+
+    Args:
+        objectives (mapping): by name.
+        sample (callable): draws a batch of windows [B, H] with torch's global generator.
+        steps (int): length of the training.
+        checkpointer (Checkpointer): where it is saved.
+        save_interval (int): steps between checkpoints.
+        log_interval (int): steps over which logged values are means.
+        log (callable): gets the step and the means.
+        meta (mapping): what the run is, checked when it is resumed.
+        resume (bool, optional): go on from the newest checkpoint. Defaults to ``False``.
+        progress (bool, optional): show a bar with losses and time left. Defaults to ``True``.
+
+    Returns:
+        The step at which it began: 0, or that of the checkpoint.
+
+    Raises:
+        CheckpointError: the checkpoint is damaged or of another run, or cannot be saved.
+        FloatingPointError: a loss is NaN or Inf; the message names it and the step.
+        Interrupted: it was asked to stop; what was done is saved.
+    """
+    meter = Meter()
+    parts: dict[str, Any] = {"meter": meter, "rng": GlobalRNGState()}
+    for name, objective in objectives.items():
+        parts.update(objective.components(name))
+    begin = 0
+    if resume and checkpointer.latest() is not None:
+        begin = checkpointer.load(None, parts, meta)["step"]
+    bar = tqdm(total=steps, initial=begin, desc="training", unit="step", disable=not progress)
+    with bar, _stop_requests() as stop:
+        for step in range(begin + 1, steps + 1):
+            meter.add(_update_all(objectives, sample(), step))
+            if step % log_interval == 0 or step == steps:
+                means = meter.read()
+                log(step, means)
+                bar.set_postfix_str(_short(means))
+            bar.update()
+            stopped = stop.requested and step < steps
+            if step % save_interval == 0 or step == steps or stopped:
+                checkpointer.save(step, parts, meta)
+            if stopped:
+                raise Interrupted(step)
+    return begin
+
+
+def _update_all(objectives, windows: TensorDictBase, step: int) -> dict[str, Tensor]:
+    values = {}
+    for name, objective in objectives.items():
+        try:
+            out = objective.update(windows)
+        except FloatingPointError as error:
+            raise FloatingPointError(
+                f"objective {name!r} at step {step}: {error} Resume from the last checkpoint with "
+                "a lower learning rate, or look at the data report."
+            ) from error
+        values.update({f"{name}/{key}": value for key, value in out.items()})
+    return values
+
+
+def _short(means: Mapping[str, float]) -> str:
+    losses = {key: value for key, value in means.items() if "/loss" in key}
+    return " ".join(f"{key.split('/')[0]}={value:.3g}" for key, value in losses.items())
+
+
+class _Stop:
+    requested = False
+
+
+@contextmanager
+def _stop_requests() -> Iterator[_Stop]:
+    """Turns the first SIGINT or SIGTERM into a request; a second SIGINT stops at once."""
+    stop = _Stop()
+
+    def ask(number, frame):
+        if stop.requested and number == signal.SIGINT:
+            raise KeyboardInterrupt
+        stop.requested = True
+
+    try:
+        before = {number: signal.signal(number, ask) for number in (signal.SIGINT, signal.SIGTERM)}
+    except ValueError:  # not the main thread: whoever started it stops it
+        before = {}
+    try:
+        yield stop
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
