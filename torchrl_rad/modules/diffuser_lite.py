@@ -199,7 +199,7 @@ class DiffuserLitePlanner(TensorDictModuleBase):
         )
         self.register_buffer("plan_times", _plan_times(self.levels), persistent=False)
 
-    @dispatch
+    @dispatch(auto_batch_size=False)
     @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes plan and action into ``tensordict`` and returns it."""

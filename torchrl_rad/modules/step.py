@@ -94,7 +94,7 @@ class StepEstimator(TensorDictModuleBase):
         """Scores of the classes [*B, H - 1] from raw states [*B, S]."""
         return self.net(torch.cat([self.normalizer(state), self.normalizer(target)], -1))
 
-    @dispatch
+    @dispatch(auto_batch_size=False)
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes the estimated steps into ``tensordict`` and returns it."""
         recorded = self.estimate == "recorded"
