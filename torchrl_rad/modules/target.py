@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Literal
+from typing import Any, Literal, NamedTuple
 
 import torch
 from tensordict import TensorDictBase
@@ -14,10 +14,19 @@ from torchrl.data.tensor_specs import Unbounded
 from torchrl.envs.transforms import TensorDictPrimer
 
 from torchrl_rad.data.database import ExpertDatabase
+from torchrl_rad.retrieval.rules import RankedRule, TolerantRule, followed_rule, highest_rule
 
 __all__ = ["RetrievalTargetModule"]
 
 OUT_KEYS = ("target", "found", "similarity", "target_return", "target_index")
+KEPT = ("retrieval", "kept")  # float64 [*B, 4]: row, similarity, offset, age
+
+
+class _Columns(NamedTuple):
+    source: object  # the search structure that they belong to
+    states: Tensor
+    values: Tensor
+    rule: RankedRule | TolerantRule
 
 
 class RetrievalTargetModule(TensorDictModuleBase):
@@ -131,41 +140,54 @@ class RetrievalTargetModule(TensorDictModuleBase):
         self.in_keys, self.out_keys = list(in_keys), list(out_keys)
         self.named_out = list(out_keys)
         if retrieval_interval > 1:
-            self.in_keys += ["is_init", ("retrieval", "kept")]
-            self.out_keys += [("next", "retrieval", "kept")]
+            self.in_keys += ["is_init", KEPT]
+            self.out_keys += [("next", *KEPT)]
+        self._columns: _Columns | None = None
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Writes the target of each row into ``tensordict`` and returns it."""
+        """Writes the target of each row into ``tensordict`` and returns it.
+
+        Raises:
+            KeyError: the state is missing, or with ``retrieval_interval`` what is kept.
+            ValueError: the state has another width than those of the database.
+        """
         state = tensordict.get(self.in_keys[0])
         if state is None:
             raise KeyError(
                 f"{self.in_keys[0]!r} is missing in the tensordict; RetrievalTargetModule reads it."
             )
         shape = state.shape[:-1]
-        query = state.reshape(-1, state.shape[-1])
-        if self.retrieval_interval > 1:
-            found = self._kept(tensordict, query)
-        else:
-            found = self.select(query)
-        index, similarity, offset = found
-        row = index.clamp_min(0)
-        table = self.database[:] if len(self.database) else None
-        hit = index >= 0
-        device = query.device
-        if table is None:
-            target, value = query, torch.zeros_like(similarity)
-        else:
-            place = row.to(self.database.device)
-            target = table[self.database.sampler.key][place].to(query)
-            value = table["return_to_go"][place].to(device)
-        finite = torch.nan_to_num(query, nan=0.0, posinf=0.0, neginf=0.0)
-        target = torch.where(hit[:, None], target, finite)
-        value = torch.where(hit, value, 0.0)
+        query = state.reshape(shape.numel(), state.shape[-1])
+        with self.database._replay_lock:  # rows chosen and rows read are of the same content
+            found = (
+                self._kept(tensordict, query) if self.retrieval_interval > 1 else self.select(query)
+            )
+            index, similarity, offset = found
+            hit = index >= 0
+            target, value = self._read(query, index, hit)
         results = (target, hit, similarity, value, index, offset)
         for key, result in zip(self.named_out, results, strict=False):
-            tensordict.set(key, result.reshape(*shape, -1))
+            width = target.shape[-1] if result is target else 1
+            tensordict.set(key, result.reshape(*shape, width))
         return tensordict
+
+    def _read(self, query: Tensor, index: Tensor, hit: Tensor) -> tuple[Tensor, Tensor]:
+        """State [Q, S] and return [Q] of the rows chosen."""
+        whole = bool(hit.all())
+        if not whole:
+            own = torch.nan_to_num(query, nan=0.0, posinf=0.0, neginf=0.0)
+            if not bool(hit.any()):
+                return own, torch.zeros(len(query), device=query.device)
+            index = index.clamp_min(0)
+        columns = self._prepare()
+        place = index.to(columns.states.device)
+        target = columns.states.index_select(0, place).to(query)
+        value = columns.values.index_select(0, place).to(query.device)
+        if not whole:
+            target = torch.where(hit[:, None], target, own)
+            value = torch.where(hit, value, 0.0)
+        return target, value
 
     # the rule
 
@@ -179,64 +201,57 @@ class RetrievalTargetModule(TensorDictModuleBase):
             Row of the target (int64 [Q], -1 if none), similarity (float32 [Q]) and recorded offset
             (int64 [Q]).
         """
-        database = self.database
-        near, similar = database.sampler.nearest(database.storage, query)  # [Q, k]
-        if near.shape[-1] == 0:
-            none = torch.full((len(query),), -1, device=query.device)
-            return none, torch.full_like(none, -torch.inf, dtype=torch.float32), none * 0
-        valid = (similar >= database.sampler.threshold) & (near >= 0)
-        rows = near.clamp_min(0)
-        choose = self._highest if self.rule == "highest" else self._followed
-        target, anchor = choose(rows, valid)  # row [Q], place of its neighbour in C_s [Q]
-        hit = valid.any(-1)
-        anchor = torch.where(hit, anchor, 0)[:, None]
-        similarity = similar.gather(-1, anchor).squeeze(-1).float()
-        offset = torch.where(hit, target - rows.gather(-1, anchor).squeeze(-1), 0)
+        database, device = self.database, query.device
+        with database._replay_lock:
+            rows, near = database.sampler.nearest(database.storage, query)  # [Q, k]
+            if rows.numel() == 0:
+                none = torch.full((len(query),), -1, device=device)
+                return none, torch.full_like(none, -torch.inf, dtype=torch.float32), none * 0
+            columns = self._prepare()
+        valid = near >= database.sampler.threshold
+        target, place = columns.rule(rows.clamp_min(0), valid)
+        hit = valid[:, 0]  # the most similar comes first
+        place = torch.where(hit[:, None], place, 0)
+        similarity = near.gather(-1, place).squeeze(-1).float()
+        offset = torch.where(hit, target - rows.gather(-1, place).squeeze(-1), 0)
         index = torch.where(hit, target, -1)
-        return index.to(query.device), similarity.to(query.device), offset.to(query.device)
+        return index.to(device), similarity.to(device), offset.to(device)
 
-    def _highest(self, rows: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
-        remaining = self.database[:]["remaining"]
-        table = self.database.window_max(self.horizon)
-        left = remaining[rows]
-        low = rows + left.clamp_max(self.min_offset)
-        high = rows + left.clamp_max(self.horizon - 1)  # inside the neighbour's own episode
-        best = torch.where(valid, table.max(low, high), -torch.inf)
-        top = best.amax(-1, keepdim=True)
-        # inside one episode the first row within tolerance is the one with the most steps left
-        first = table.first(low, high, top, self.tolerance).minimum(high)
-        fits = valid & (top - best <= self.tolerance)
-        longest = torch.where(fits, remaining[first], -1)
-        fits &= longest == longest.amax(-1, keepdim=True)
-        value = torch.where(fits, table.values[first], -torch.inf)
-        fits &= value == value.amax(-1, keepdim=True)
-        target = torch.where(fits, first, torch.iinfo(torch.int64).max).amin(-1)
-        # neighbours are ordered: the first that reaches the target is the most similar one
-        reaches = valid & (low <= target[:, None]) & (target[:, None] <= high)
-        return target, reaches.int().argmax(-1)
-
-    def _followed(self, rows: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
-        remaining = self.database[:]["remaining"]
-        table = self.database.window_max(self.ahead + 1)
-        value = torch.where(valid, table.values[rows], -torch.inf)
-        anchor = value.argmax(-1)  # the first of equals: more similar, then the lower row
-        low = rows.gather(-1, anchor[:, None]).squeeze(-1)
-        high = low + remaining[low].clamp_max(self.ahead)
-        return table.first(low, high, table.max(low, high), 0.0), anchor
+    def _prepare(self) -> _Columns:
+        """The columns of the database as it is; made anew when its search structure was."""
+        source = self.database.sampler.build(self.database.storage)
+        if self._columns is None or self._columns.source is not source:
+            rows = self.database[:]
+            values, remaining = rows["return_to_go"], rows["remaining"]
+            if self.rule == "followed":
+                rule: RankedRule | TolerantRule = followed_rule(values, remaining, self.ahead)
+            else:
+                limits = (self.horizon, self.min_offset, self.tolerance)
+                rule = highest_rule(values, remaining, *limits)
+            states = rows[self.database.sampler.key]
+            self._columns = _Columns(source, states, values, rule)
+        return self._columns
 
     # keeping a target for several steps
 
     def _kept(self, tensordict: TensorDictBase, query: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        kept = tensordict.get(("retrieval", "kept")).reshape(-1, 4)
-        age = kept[:, 3]  # before it index, similarity, offset
-        fresh = tensordict.get("is_init").reshape(-1)
-        fresh = fresh | (age >= self.retrieval_interval) | (age == 0)
+        kept, start = tensordict.get(KEPT), tensordict.get("is_init")
+        if kept is None or start is None:
+            raise KeyError(
+                f"retrieval_interval={self.retrieval_interval} needs 'is_init' and {KEPT} in the "
+                "tensordict; add InitTracker() and make_tensordict_primer() to the environment."
+            )
+        index, _, _, age = kept.reshape(-1, 4).unbind(-1)
+        fresh = start.reshape(-1) | (age >= self.retrieval_interval) | (age == 0)
+        # nothing to keep: no target yet, a row that is gone, a state that is none
+        fresh |= (index < 0) | (index >= len(self.database)) | ~query.isfinite().all(-1)
         # a kept target comes one recorded step nearer with each step
-        state = kept + kept.new_tensor([0.0, 0.0, -1.0, 1.0])
+        state = kept.reshape(-1, 4) + kept.new_tensor([0.0, 0.0, -1.0, 1.0])
+        state[:, 2].clamp_min_(0.0)
         if fresh.any():
             renewed = torch.stack([value.double() for value in self.select(query[fresh])], -1)
             state[fresh] = torch.nn.functional.pad(renewed, (0, 1), value=1.0)
-        tensordict.set(("next", "retrieval", "kept"), state.reshape(*tensordict.batch_size, 4))
+        tensordict.set(("next", *KEPT), state.reshape(kept.shape))
         return state[:, 0].long(), state[:, 1].float(), state[:, 2].long()
 
     def make_tensordict_primer(self) -> TensorDictPrimer:
@@ -245,7 +260,10 @@ class RetrievalTargetModule(TensorDictModuleBase):
         Needed where ``retrieval_interval`` is larger than 1.
         """
         spec = Unbounded((4,), dtype=torch.float64)
-        return TensorDictPrimer({("retrieval", "kept"): spec}, default_value=0.0, expand_specs=True)
+        return TensorDictPrimer({KEPT: spec}, default_value=0.0, expand_specs=True)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_columns": None}
 
     def extra_repr(self) -> str:
         names = ("rule", "horizon", "tolerance", "ahead", "min_offset", "retrieval_interval")

@@ -59,6 +59,11 @@ class RetrievalSampler(Sampler):
         (tensor([[2, 1]]), tensor([[True, True]]))
     """
 
+    _revision: tuple | None
+    _index: ScanIndex | TreeIndex | None
+    _scale: tuple[Tensor, Tensor] | None
+    _width: int  # of a state in the storage
+
     def __init__(
         self,
         metric: Metric = "cosine",
@@ -70,6 +75,9 @@ class RetrievalSampler(Sampler):
         key: str | tuple[str, ...] = "observation",
     ):
         super().__init__()
+        self._configure(metric, dims, k, threshold, normalize, backend, key)
+
+    def _configure(self, metric, dims, k, threshold, normalize, backend, key) -> None:
         if metric not in ("cosine", "euclidean"):
             raise ValueError(f"metric is {metric!r}; expected 'cosine' or 'euclidean'.")
         if backend not in ("auto", "scan", "tree"):
@@ -78,12 +86,15 @@ class RetrievalSampler(Sampler):
             raise ValueError(f"k is {k}; at least one neighbour is needed.")
         if not 0.0 <= threshold <= 1.0:
             raise ValueError(f"threshold is {threshold}; a similarity threshold lies in [0, 1].")
+        if dims is not None and (len(dims) == 0 or min(dims) < 0):
+            raise ValueError(
+                f"dims are {dims}; expected places in a state, from 0, or None for all."
+            )
         self.metric, self.k, self.threshold = metric, int(k), float(threshold)
         self.dims = None if dims is None else [int(dim) for dim in dims]
-        self.normalize, self.backend, self.key = normalize, backend, key
-        self._revision: tuple | None = None
-        self._index: ScanIndex | TreeIndex | None = None
-        self._scale: tuple[Tensor, Tensor] | None = None
+        self.normalize, self.backend = normalize, backend
+        self.key = tuple(key) if isinstance(key, list) else key  # JSON knows no tuples
+        self.invalidate()
 
     @property
     def config(self) -> dict[str, Any]:
@@ -110,8 +121,8 @@ class RetrievalSampler(Sampler):
 
         Returns:
             Rows, int64 [*B, k], -1 where there is none, and ``{"similarity", "valid"}``: float32
-            and bool [*B, k]. The similarity of the nearest rows is given also where it lies below the
-            threshold.
+            and bool [*B, k]. The similarity of the nearest rows is given also where it lies below
+            the threshold.
 
         Raises:
             ValueError: the query has another width than the rows.
@@ -134,47 +145,55 @@ class RetrievalSampler(Sampler):
         """The nearest rows of queries [Q, S], whatever the threshold.
 
         Returns:
-            Rows, int64 [Q, min(k, N)], and similarities, float64; -1 and -inf for a query with NaN
-            or Inf.
+            Rows, int64 [Q, min(k, N)], and similarities, float64, on the device of the rows; -1 and
+            -inf for a query with NaN or Inf.
         """
         count = len(storage)
         if count == 0:
             rows = torch.full((len(query), 0), -1)
             return rows, torch.empty(len(query), 0, dtype=torch.float64)
-        index = self._build(storage)
-        query = self._prepare(query.detach().to(index.rows.device))
-        if query.shape[-1] != index.rows.shape[-1]:
+        index = self.build(storage)
+        if query.shape[-1] != self._width:
             raise ValueError(
-                f"the query compares {query.shape[-1]} entries, the database "
-                f"{index.rows.shape[-1]}; pass states as wide as those it was filled with."
+                f"the query has {query.shape[-1]} entries, a state of the database {self._width}; "
+                "pass states as wide as those it was filled with."
             )
+        query = query.detach().to(index.rows.device, torch.float64)
         finite = query.isfinite().all(-1, keepdim=True)
-        near, rows = index.search(torch.where(finite, query, 0.0), min(self.k, count))
-        return torch.where(finite, rows, -1), torch.where(finite, near, -torch.inf)
+        whole = bool(finite.all())
+        if not whole:
+            query = torch.where(finite, query, 0.0)
+        near, rows = index.search(self._prepare(query), min(self.k, count))
+        if not whole:
+            near, rows = torch.where(finite, near, -torch.inf), torch.where(finite, rows, -1)
+        return rows, near
 
     def _prepare(self, states: Tensor) -> Tensor:
         if self.dims is not None:
-            if max(self.dims) >= states.shape[-1]:
-                width = states.shape[-1]
-                raise ValueError(f"dims are {self.dims}, but a state has {width} entries.")
-            states = states[..., self.dims]
+            states = states.index_select(-1, torch.tensor(self.dims, device=states.device))
         if self._scale is not None:
             mean, deviation = self._scale
-            dtype = torch.promote_types(states.dtype, torch.float32)
-            states = ((states.double() - mean) / deviation).to(dtype)
+            states = (states.double() - mean) / deviation
         return states
 
-    def _build(self, storage: Any) -> ScanIndex | TreeIndex:
+    def build(self, storage: Any) -> ScanIndex | TreeIndex:
+        """The search structure of the storage: the same object until the storage changes."""
         revision = storage_revision(storage)
         if self._index is None or self._revision != revision:
-            self._scale = None
-            rows = self._prepare(storage[:].get(self.key))
+            self.invalidate()
+            states = storage[:].get(self.key)
+            self._width = states.shape[-1]
+            if self.dims is not None and max(self.dims) >= self._width:
+                raise ValueError(f"dims are {self.dims}, but a state has {self._width} entries.")
+            rows = self._prepare(states)
             if self.normalize:
-                deviation = rows.double().std(0, correction=0)
-                self._scale = (rows.double().mean(0), torch.where(deviation > 0, deviation, 1.0))
-                rows = self._prepare(storage[:].get(self.key))
-            self._index = build_index(rows, self.metric, self.backend)
-            self._revision = revision
+                rows = rows.double()
+                # a constant entry stays as it is; its deviation may differ from 0 by rounding
+                varies = rows.amax(0) > rows.amin(0)
+                deviation = torch.where(varies, rows.std(0, correction=0), 1.0)
+                self._scale = (rows.mean(0), deviation)
+                rows = self._prepare(states)
+            self._index, self._revision = build_index(rows, self.metric, self.backend), revision
         return self._index
 
     def invalidate(self) -> None:
@@ -193,7 +212,7 @@ class RetrievalSampler(Sampler):
         return self.config
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        self.__init__(**state_dict)  # type: ignore[misc]
+        self._configure(**state_dict)
 
     def dumps(self, path: str | Path) -> None:
         path = Path(path)

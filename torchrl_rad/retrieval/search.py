@@ -56,9 +56,14 @@ def _sum_last(values: Tensor) -> Tensor:
 
 def _order(similarity: Tensor, index: Tensor, k: int) -> tuple[Tensor, Tensor]:
     """The k most similar of each row of candidates [Q, C], ties by the lower index: two [Q, k]."""
-    index, order = index.sort(dim=-1)
-    similarity, ranked = similarity.gather(-1, order).sort(dim=-1, descending=True, stable=True)
-    return similarity[:, :k], index.gather(-1, ranked[:, :k])
+    similarity, order = similarity.sort(dim=-1, descending=True, stable=True)
+    index = index.gather(-1, order)
+    tied = (similarity[:, 1:] == similarity[:, :-1]).any(-1)
+    if tied.any():
+        places, order = index[tied].sort(dim=-1)
+        near, ranked = similarity[tied].gather(-1, order).sort(dim=-1, descending=True, stable=True)
+        similarity[tied], index[tied] = near, places.gather(-1, ranked)
+    return similarity[:, :k], index[:, :k]
 
 
 class ScanIndex:
@@ -132,32 +137,37 @@ class TreeIndex:
     metric: Metric = "euclidean"
 
     def __init__(self, rows: Tensor):
-        self.rows = rows
-        self.tree = cKDTree(rows.double().numpy(), balanced_tree=False, compact_nodes=False)
+        self.rows = rows.double().contiguous()
+        self.tree = cKDTree(
+            self.rows.numpy(), leafsize=32, balanced_tree=False, compact_nodes=False
+        )
 
     def search(self, query: Tensor, k: int) -> tuple[Tensor, Tensor]:
         """As :meth:`ScanIndex.search`."""
-        count = len(self.rows)
-        wanted = min(k + 1, count)
-        distance, index = self.tree.query(query.double().numpy(), k=np.arange(1, wanted + 1))
-        index = torch.from_numpy(index.astype(np.int64))
-        near, order = _order(similarity(query[:, None], self.rows[index], "euclidean"), index, k)
+        wanted = min(k + 1, len(self.rows))
+        distance, places = self.tree.query(query.double().numpy(), k=np.arange(1, wanted + 1))
+        if np.isinf(distance[:, -1:]).any():  # too far for the tree, which then finds nothing
+            return ScanIndex(self.rows, self.metric).search(query, k)
+        index = torch.from_numpy(places)
+        near = self.rows.index_select(0, index.view(-1)).view(*index.shape, -1)
+        near, index = _order(similarity(query[:, None], near, self.metric), index, wanted)
         if wanted > k:
-            # the tree is free in what it takes among rows as far as the last one: ask a scan there
-            tied = distance[:, k] <= distance[:, k - 1] * (1 + 1e-12)
+            # the tree is free in what it takes among rows as far as the last one: look around
+            tied = near[:, k] >= near[:, k - 1] * (1 - 1e-12)
             if tied.any():
-                again = torch.from_numpy(tied.nonzero()[0])
-                near[again], order[again] = self._around(query[again], distance[tied, k], k)
-        return near, order
+                radius = distance[tied.numpy(), k]
+                near[tied, :k], index[tied, :k] = self._around(query[tied], radius, k)
+        return near[:, :k], index[:, :k]
 
     def _around(self, query: Tensor, radius: np.ndarray, k: int) -> tuple[Tensor, Tensor]:
         """All rows within the radius, ordered: exact among ties."""
-        found = self.tree.query_ball_point(query.double().numpy(), radius * (1 + 1e-9))
+        # a little more: distances so close give equal similarities
+        found = self.tree.query_ball_point(query.double().numpy(), radius * (1 + 1e-9) + 1e-11)
         results = []
         for row, candidates in zip(query, found, strict=True):
-            index = torch.tensor(candidates)[None]
-            near = similarity(row, self.rows[index[0]], "euclidean")[None]
-            results.append(_order(near, index, k))
+            index = torch.tensor(candidates)
+            near = similarity(row, self.rows[index], self.metric)
+            results.append(_order(near[None], index[None], k))
         return torch.cat([r[0] for r in results]), torch.cat([r[1] for r in results])
 
 

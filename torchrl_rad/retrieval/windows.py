@@ -53,5 +53,7 @@ class WindowMax:
             span = 1 << level
             fits = row + span <= high + 1
             here = self.table[level][row.clamp_max(len(self.values) - 1)]
-            row = torch.where(fits & (best - here > tolerance), row + span, row)
+            # float64: the difference of two float32 would be rounded
+            misses = best.double() - here.double() > tolerance
+            row = torch.where(fits & misses, row + span, row)
         return row

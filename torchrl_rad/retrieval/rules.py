@@ -1,0 +1,139 @@
+"""Which row to go for, given the neighbours of a state."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from torchrl_rad.retrieval.windows import WindowMax
+
+__all__ = ["RankedRule", "TolerantRule", "followed_rule", "highest_rule"]
+
+
+class RankedRule:
+    """Follows the neighbour of the highest rank; of equals the first, which is more similar.
+
+    Where a row leads and how good that is do not depend on the query, so that both are columns.
+
+    Args:
+        rank (Tensor): int64 [N], not negative.
+        target (Tensor): int64 [N], the row to go for from each row.
+
+    Examples:
+        >>> rule = RankedRule(torch.tensor([0, 5, 5]), torch.tensor([0, 2, 2]))
+        >>> target, place = rule(torch.tensor([[0, 2, 1]]), torch.tensor([[True, True, True]]))
+        >>> target, place
+        (tensor([2]), tensor([[1]]))
+    """
+
+    def __init__(self, rank: Tensor, target: Tensor):
+        small = len(rank) < 2**31  # half as much memory to read for each query
+        self.rank = rank.to(torch.int32) if small else rank
+        self.target = target
+
+    def __call__(self, rows: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
+        """Chooses a row for each query.
+
+        Args:
+            rows (Tensor): int64 [Q, k], neighbours, most similar first.
+            valid (Tensor): bool [Q, k], which of them are neighbours; at least one.
+
+        Returns:
+            The row to go for, int64 [Q], and the place of its neighbour in ``rows``, int64 [Q, 1].
+            Without any neighbour: some row and place 0.
+        """
+        rank = self.rank.index_select(0, rows.reshape(-1)).view(rows.shape)
+        place = rank.masked_fill_(~valid, -1).argmax(-1, keepdim=True)
+        row = rows.gather(-1, place).squeeze(-1)
+        return self.target.index_select(0, row), place
+
+
+class TolerantRule:
+    """``rule="highest"`` with a tolerance: what counts as good enough depends on the query.
+
+    Args:
+        values (Tensor): float32 [N], returns.
+        remaining (Tensor): int64 [N], steps left in the episode.
+        horizon (int): a target lies at most ``horizon - 1`` rows ahead.
+        min_offset (int): and at least so many, as far as the episode goes.
+        tolerance (float): in units of return.
+
+    Examples:
+        >>> values, remaining = torch.tensor([0.0, 2.0, 3.0, 2.5]), torch.tensor([3, 2, 1, 0])
+        >>> rule = TolerantRule(values, remaining, horizon=4, min_offset=0, tolerance=1.0)
+        >>> rule(torch.tensor([[2, 0]]), torch.tensor([[True, True]]))
+        (tensor([1]), tensor([[1]]))
+    """
+
+    def __init__(
+        self, values: Tensor, remaining: Tensor, horizon: int, min_offset: int, tolerance: float
+    ):
+        self.table, self.remaining, self.tolerance = (
+            WindowMax(values, horizon),
+            remaining,
+            tolerance,
+        )
+        self.low, self.high = _window(remaining, min_offset, horizon - 1)
+        self.peak = self.table.max(self.low, self.high)
+
+    def __call__(self, rows: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
+        """As :meth:`RankedRule.__call__`."""
+        peak = torch.where(valid, self.peak[rows], -torch.inf)
+        top = peak.amax(-1, keepdim=True)
+        # float64: the difference of two float32 would be rounded
+        fits = valid & (top.double() - peak.double() <= self.tolerance)
+        query, place = fits.nonzero(as_tuple=True)
+        near = rows[query, place]
+        # inside one episode the first row within tolerance is the one with the most steps left
+        row = self.table.first(self.low[near], self.high[near], top[query, 0], self.tolerance)
+        first = rows.masked_scatter(fits, row)
+        left = torch.where(fits, self.remaining[first], -1)
+        fits = left == left.amax(-1, keepdim=True)
+        value = torch.where(fits, self.table.values[first], -torch.inf)
+        fits = value == value.amax(-1, keepdim=True)
+        target = torch.where(fits, first, torch.iinfo(torch.int64).max).amin(-1, keepdim=True)
+        reaches = valid & (self.low[rows] <= target) & (target <= self.high[rows])
+        return target.squeeze(-1), reaches.int().argmax(-1, keepdim=True)
+
+
+def followed_rule(values: Tensor, remaining: Tensor, ahead: int) -> RankedRule:
+    """``rule="followed"``: the neighbour with the largest return; the best of its next rows.
+
+    Args:
+        values (Tensor): float32 [N], returns.
+        remaining (Tensor): int64 [N], steps left in the episode.
+        ahead (int): number of rows looked ahead.
+    """
+    table = WindowMax(values, ahead + 1)
+    low, high = _window(remaining, 0, ahead)
+    target = table.first(low, high, table.max(low, high), 0.0)
+    return RankedRule(values.unique(return_inverse=True)[1], target)
+
+
+def highest_rule(
+    values: Tensor, remaining: Tensor, horizon: int, min_offset: int = 0, tolerance: float = 0.0
+) -> RankedRule | TolerantRule:
+    """``rule="highest"``, the paper's: arguments as of :class:`TolerantRule`.
+
+    Without tolerance the best row of each row's window can be ranked beforehand. A neighbour whose
+    window holds the chosen row leads to that very row: an earlier one as good has more steps left.
+    """
+    if tolerance > 0:
+        return TolerantRule(values, remaining, horizon, min_offset, tolerance)
+    table = WindowMax(values, horizon)
+    low, high = _window(remaining, min_offset, horizon - 1)
+    target = table.first(low, high, table.max(low, high), 0.0)
+    rows, place = target.unique(return_inverse=True)
+    # by return, then steps left, then the lower row: the last sort decides first
+    order = torch.arange(len(rows) - 1, -1, -1, device=rows.device)
+    order = order[remaining[rows[order]].sort(stable=True).indices]
+    order = order[values[rows[order]].sort(stable=True).indices]
+    rank = torch.empty_like(order)
+    rank[order] = torch.arange(len(rows), device=rows.device)
+    return RankedRule(rank[place], target)
+
+
+def _window(remaining: Tensor, least: int, most: int) -> tuple[Tensor, Tensor]:
+    """First and last row, int64 [N], of those ``least`` to ``most`` ahead in the same episode."""
+    row = torch.arange(len(remaining), device=remaining.device)
+    return row + remaining.clamp_max(least), row + remaining.clamp_max(most)
