@@ -39,10 +39,17 @@ def similarity(query: Tensor, rows: Tensor, metric: Metric) -> Tensor:
     """
     query, rows = query.double(), rows.double()
     if metric == "euclidean":
-        return 1.0 / (1.0 + _sum_last((query - rows).square()).sqrt())
+        return 1.0 / (1.0 + _sqrt(_sum_last((query - rows).square())))
     product = _sum_last(query * rows)
-    size = _sum_last(query.square()).sqrt() * _sum_last(rows.square()).sqrt()
+    size = _sqrt(_sum_last(query.square())) * _sqrt(_sum_last(rows.square()))
     return torch.where(size > 0, product / size.clamp_min(1e-300), -torch.inf)
+
+
+def _sqrt(values: Tensor) -> Tensor:
+    # torch's own on a CPU can be off by the last bit, which decides ties
+    if values.is_cpu and not values.requires_grad:
+        return torch.from_numpy(np.asarray(np.sqrt(values.numpy())))
+    return values.sqrt()
 
 
 def _sum_last(values: Tensor) -> Tensor:
