@@ -81,6 +81,11 @@ class PlanNetworks(nn.ModuleList):
     def forward(self, level: int, sample: Tensor, mask: Tensor, time: Tensor) -> Tensor:
         return self[level](sample, mask, time)
 
+    def reset_parameters_recursive(self) -> None:
+        """Draws new weights, as a TensorDictModule does."""
+        for network in self:
+            network.reset_parameters()  # type: ignore[operator]
+
 
 class DiffuserLitePlanner(TensorDictModuleBase):
     """Plans states on ever finer grids and acts by inverse dynamics (DL-RAD).

@@ -101,9 +101,10 @@ class DiT(nn.Module):
         self.norm = nn.LayerNorm(width, eps=1e-6, elementwise_affine=False)
         self.modulation = nn.Linear(width, 2 * width)
         self.head = nn.Linear(width, state_dim)
-        self._initialise()
+        self.reset_parameters()
 
-    def _initialise(self) -> None:
+    def reset_parameters(self) -> None:
+        """Draws new weights, such that the output is zero."""
         for module in self.modules():
             if isinstance(module, nn.Linear):
                 nn.init.xavier_uniform_(module.weight)

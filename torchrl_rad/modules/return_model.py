@@ -40,6 +40,12 @@ class ReturnModel(nn.Module):
         self.register_buffer("mean", torch.zeros(()))
         self.register_buffer("deviation", torch.ones(()))
 
+    def reset_parameters_recursive(self) -> None:
+        """Draws new weights, as a TensorDictModule does; the scale stays."""
+        for layer in self.net:
+            if isinstance(layer, nn.Linear):
+                layer.reset_parameters()
+
     def fit_scale(self, returns: Tensor) -> ReturnModel:
         """Takes mean and deviation of recorded returns as the unit of the network's output.
 

@@ -95,13 +95,14 @@ class DenoisingLoss(LossModule):
         self.planner_normalizer = planner.normalizer
         self.levels, self.horizon = planner.levels, planner.horizon
         self.process, self.placement = planner.process, planner.placement
+        self._out_keys = ["loss_denoising", *(f"level_{n}" for n in range(len(self.levels)))]
         self.no_target = no_target if planner.targets else 1.0
         self.next_weight = next_weight
         self.reduction = "mean" if reduction is None else reduction
 
     @property
     def out_keys(self) -> list[str]:
-        return ["loss_denoising", *(f"level_{number}" for number in range(len(self.levels)))]
+        return self._out_keys
 
     @out_keys.setter
     def out_keys(self, value: list[str]) -> None:
