@@ -3,18 +3,29 @@
 from __future__ import annotations
 
 import hashlib
+import io
 import json
 import os
+import shutil
 import warnings
+import zipfile
+import zlib
 from collections import deque
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tqdm import tqdm
 
-from torchrl_rad._files import CheckpointError, staged_folder, verify_manifest, write_json
+from torchrl_rad._files import (
+    CheckpointError,
+    staged_folder,
+    verify_manifest,
+    write_atomic,
+    write_json,
+)
 from torchrl_rad.envs.maze import FixedGoalMaze, MazeTask, maze_task
 
 __all__ = ["cache_dir", "collect_pointmaze", "next_cells", "pointmaze_dataset"]
@@ -24,6 +35,7 @@ POSITION_GAIN = 10.0
 VELOCITY_GAIN = -1.0
 ACTION_NOISE = 0.5
 WAYPOINT_RADIUS = 0.1  # a waypoint is solved within this distance
+PART = 50  # episodes in a part of an interrupted collection
 FORMAT = 2  # raise it when the content of the cache changes
 
 
@@ -67,15 +79,24 @@ def next_cells(free: np.ndarray) -> np.ndarray:
 
 
 def collect_pointmaze(
-    task: MazeTask, steps: int, seed: int = 0, progress: bool = True
+    task: MazeTask,
+    steps: int,
+    seed: int = 0,
+    progress: bool = True,
+    parts: str | Path | None = None,
 ) -> TensorDict:
     """Records whole episodes of the waypoint controller (D4RL's Maze2D collection; RAD, appendix).
+
+    Fewer steps give the first episodes of more steps, and an interrupted collection goes on to the
+    same data.
 
     Args:
         task (MazeTask): the maze; an episode has ``task.max_steps`` steps.
         steps (int): number of steps, rounded up to whole episodes.
         seed (int, optional): seed of starts, goals and noise. Defaults to ``0``.
         progress (bool, optional): show a progress bar. Defaults to ``True``.
+        parts (path, optional): folder to keep finished parts in, which a further call with the same
+            arguments picks up.
 
     Returns:
         Flat TensorDict [T]: ``observation`` [T, 4], ``action`` [T, 2], ``episode`` [T] int64 and
@@ -96,25 +117,71 @@ def collect_pointmaze(
     episodes = -(-steps // task.max_steps)
     states = np.empty((episodes, task.max_steps + 1, 4), np.float32)
     actions = np.empty((episodes, task.max_steps, 2), np.float32)
-    rng = np.random.default_rng(seed)
-    env.reset(seed=seed)
     table = next_cells(env.free_cells)
     bar = tqdm(
-        range(episodes), desc=f"collecting {task.env_id}", unit="episode", disable=not progress
+        total=episodes, desc=f"collecting {task.env_id}", unit="episode", disable=not progress
     )
-    for episode in bar:
-        _record(env, table, rng, states[episode], actions[episode])
+    rng = np.random.default_rng(seed)
+    env.reset(seed=seed)
+    sources = (rng, env.unwrapped.np_random)
+    with bar:
+        for begin in range(0, episodes, PART):
+            part = slice(begin, min(begin + PART, episodes))
+            saved = None if parts is None else Path(parts) / f"{part.start}-{part.stop}.npz"
+            if saved is not None and _load_part(saved, states[part], actions[part], sources):
+                bar.update(part.stop - part.start)
+                continue
+            for episode in range(part.start, part.stop):
+                _record(env, table, rng, states[episode], actions[episode])
+                bar.update()
+            if saved is not None:
+                _save_part(saved, states[part], actions[part], sources)
     env.close()
     return _flat(states, actions, env.goal)
 
 
-def _record(env, table, rng, states, actions) -> None:
+Sources = tuple[np.random.Generator, ...]
+
+
+def _load_part(path: Path, states: np.ndarray, actions: np.ndarray, sources: Sources) -> bool:
+    """Fills the arrays and sets the random sources as they were after the part.
+
+    Returns:
+        False if the file is missing or damaged.
+    """
+    try:
+        with np.load(path) as part:
+            states[:], actions[:] = part["states"], part["actions"]
+            after = json.loads(str(part["sources"]))
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error):
+        return False
+    for source, state in zip(sources, after, strict=True):
+        source.bit_generator.state = state
+    return True
+
+
+def _save_part(path: Path, states: np.ndarray, actions: np.ndarray, sources: Sources) -> None:
+    after = json.dumps([source.bit_generator.state for source in sources])
+    file = io.BytesIO()
+    np.savez(file, states=states, actions=actions, sources=np.array(after))
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_atomic(path, file.getvalue())
+
+
+def _record(
+    env: FixedGoalMaze,
+    table: np.ndarray,
+    rng: np.random.Generator,
+    states: np.ndarray,
+    actions: np.ndarray,
+) -> None:
     """Drives one episode into ``states`` [L + 1, 4] and ``actions`` [L, 2]."""
     centres = np.asarray([env.maze.cell_rowcol_to_xy(cell) for cell in env.free_cells])
     number = {tuple(cell): i for i, cell in enumerate(env.free_cells.tolist())}
     noise = rng.normal(0.0, ACTION_NOISE, actions.shape)
     states[0], _ = env.reset()
-    point = env.unwrapped.point_env  # the maze's physics without its goal bookkeeping
+    robot: Any = env.unwrapped
+    point = robot.point_env  # the maze's physics without its goal bookkeeping
     state = states[0].astype(np.float64)
     goal = rng.integers(len(centres))
     here = number[tuple(env.maze.cell_xy_to_rowcol(state[:2]))]
@@ -160,7 +227,7 @@ def pointmaze_dataset(
     """The collected data of one maze, from the cache or collected now and cached.
 
     The folder's name holds the settings; it appears only when the data is complete. A damaged one
-    is replaced, with a warning.
+    is replaced, with a warning; an interrupted collection goes on where it was.
 
     Args:
         maze (str): ``"umaze"``, ``"medium"`` or ``"large"``.
@@ -192,7 +259,8 @@ def pointmaze_dataset(
     digest = hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()[:8]
     path = Path(root or cache_dir()) / f"pointmaze-{maze}-{steps}-seed{seed}-{digest}"
     if not _is_whole(path):
-        data = collect_pointmaze(task, steps, seed, progress)
+        parts = path.with_name(f".{path.name}.parts")
+        data = collect_pointmaze(task, steps, seed, progress, parts)
         try:
             with staged_folder(path, replace=True) as stage:
                 data.memmap(stage / "steps")
@@ -200,6 +268,7 @@ def pointmaze_dataset(
         except OSError:
             if not _is_whole(path):  # else another process was faster: its data is the same
                 raise
+        shutil.rmtree(parts, ignore_errors=True)
     return TensorDict.load_memmap(path / "steps")
 
 

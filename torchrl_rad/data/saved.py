@@ -61,7 +61,8 @@ def read_config(path: Path, sizes_only: bool) -> dict[str, Any]:
             f"{path} holds no database: database.json is missing. Pass a folder that "
             "ExpertDatabase.dumps wrote."
         )
-    listed = verify_manifest(path, ("database.json",) if sizes_only else None)
+    listed = verify_manifest(path, ("database.json",))
+    verify_manifest(path, [n for n in listed if not sizes_only or n.endswith(".json")])
     for name, entry in listed.items():
         size = (path / name).stat().st_size if (path / name).is_file() else None
         if size != entry["bytes"]:

@@ -72,13 +72,13 @@ class WindowSampler(Sampler):
         if self._starts is None or self._revision != revision:
             lengths = episode_lengths(storage[:])
             _, remaining = step_and_remaining(lengths)
-            self._starts = (remaining >= self.length - 1).nonzero().squeeze(-1)
-            self._revision = revision
-            if len(self._starts) == 0:
+            starts = (remaining >= self.length - 1).nonzero().squeeze(-1)
+            if len(starts) == 0:
                 raise ValueError(
                     f"no episode has {self.length} steps (the longest has {int(lengths.max())}); "
                     "use a shorter horizon, or join the episodes of a stream (join_stream)."
                 )
+            self._starts, self._revision = starts, revision
         return self._starts
 
     def sample(self, storage: Any, batch_size: int) -> tuple[Tensor, dict]:

@@ -83,6 +83,9 @@ class FixedGoalMaze(gym.Wrapper):
         goal_cell (tuple of int, optional): another goal cell (row, column).
         reset_cell (tuple of int, optional): a fixed start cell instead of a uniform one.
 
+    Raises:
+        ValueError: a cell is no (row, column), a wall, or outside the map.
+
     Examples:
         >>> env = FixedGoalMaze(maze_task("umaze"))
         >>> observation, _ = env.reset(seed=0)
@@ -102,9 +105,11 @@ class FixedGoalMaze(gym.Wrapper):
         robot: Any = self.unwrapped
         robot.position_noise_range = RESET_NOISE
         self.maze = robot.maze
-        self.goal_cell = np.asarray(task.goal_cell if goal_cell is None else goal_cell)
+        self.goal_cell = _cell("goal_cell", task.goal_cell if goal_cell is None else goal_cell)
         self.free_cells = free_cells(self.maze.maze_map)
-        self.reset_cells = self.free_cells if reset_cell is None else np.asarray([reset_cell])
+        self.reset_cells = self.free_cells
+        if reset_cell is not None:
+            self.reset_cells = _cell("reset_cell", reset_cell)[None]
         for cell in (self.goal_cell, *self.reset_cells):
             if not (self.free_cells == cell).all(-1).any():
                 raise ValueError(
@@ -126,6 +131,13 @@ class FixedGoalMaze(gym.Wrapper):
         state = self.adapter(observation)
         reward = float(np.linalg.norm(state[:2] - self.goal) <= GOAL_RADIUS)
         return state, reward, terminated, truncated, {}
+
+
+def _cell(name: str, value: Any) -> np.ndarray:
+    cell = np.asarray(value)
+    if cell.shape != (2,) or cell.dtype.kind not in "iu":
+        raise ValueError(f"{name} is {value}; expected (row, column), two whole numbers.")
+    return cell
 
 
 def free_cells(maze_map: list[list[Any]]) -> np.ndarray:
@@ -175,7 +187,17 @@ def make_maze_env(
         rows (int): number of mazes.
         seed (int, optional): seed of the start states. Defaults to ``0``.
         goal_cell (tuple of int, optional): another goal cell.
+
+    Raises:
+        ValueError: ``rows`` is below 1, or the goal cell cannot be stood on.
+
+    Examples:
+        >>> env = make_maze_env(maze_task("umaze"), 2)
+        >>> env.rollout(3)["next", "reward"].shape
+        torch.Size([2, 3, 1])
     """
+    if rows < 1:
+        raise ValueError(f"rows is {rows}; an environment has at least one row.")
 
     def make_row() -> TransformedEnv:
         # the cast sits inside each row: outside a batched env it breaks partial steps
