@@ -10,9 +10,12 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from tensordict import TensorDict
+from torchrl.collectors import Collector
 from torchrl.data import LazyMemmapStorage, LazyTensorStorage
 from torchrl.data.replay_buffers import Sequence
 from torchrl.data.replay_buffers.samplers import RandomSampler
+from torchrl.envs import SerialEnv, StepCounter, TransformedEnv
+from torchrl.testing.mocking_classes import ContinuousActionVecMockEnv
 
 from torchrl_rad.data import (
     ExpertDatabase,
@@ -204,6 +207,31 @@ def test_collected_batch_that_is_not_flat():
         ExpertDatabase(LazyTensorStorage(100)).extend(collected(2, 6))
 
 
+@pytest.mark.filterwarnings("ignore")
+def test_collector_fills_it():
+    torch.manual_seed(0)
+    sampler = RetrievalSampler("euclidean", k=3, threshold=0.0)
+    database = ExpertDatabase(LazyTensorStorage(100), gamma=1.0, sampler=sampler)
+    env = TransformedEnv(ContinuousActionVecMockEnv(), StepCounter(max_steps=4))
+    collector = Collector(
+        SerialEnv(2, lambda: env),
+        frames_per_batch=8,
+        total_frames=24,
+        trajs_per_batch=2,
+        traj_format="cat",
+        replay_buffer=database,
+    )
+    for batch in collector:
+        assert batch is None
+    collector.shutdown()
+    rows = database[:]
+    lengths = rows["episode"].unique_consecutive(return_counts=True)[1]
+    assert len(lengths) >= 4 and len(rows["episode"].unique()) == len(lengths)
+    assert torch.equal(rows["remaining"] == 0, rows["next", "done"][:, 0])
+    hits = database.retrieve(rows["observation"])
+    assert torch.equal(hits["index"][:, 0], torch.arange(len(rows)))
+
+
 # bad input
 
 
@@ -329,7 +357,7 @@ def test_foreign_sampler():
 
 
 @pytest.mark.parametrize("storage", STORAGES)
-@pytest.mark.parametrize("shape", [(), (4,), (2, 3), (2, 1, 2), (0,)])
+@pytest.mark.parametrize("shape", [(), (4,), (2, 3), (2, 1, 2)])
 def test_retrieve_shapes(storage, shape):
     database = make_database([[0, 1, 0]], storage)
     hits = database.retrieve(torch.ones(*shape, 1))
@@ -340,6 +368,12 @@ def test_retrieve_shapes(storage, shape):
     assert hits["valid"].dtype == torch.bool
     assert hits["observation"].shape == (*shape, 3, 1)
     assert hits["next", "reward"].shape == (*shape, 3, 1)
+
+
+def test_retrieve_for_no_query():
+    database = make_database([[0, 1]], sampler=RetrievalSampler("cosine", k=3, backend="scan"))
+    hits = database.retrieve(torch.ones(0, 1))
+    assert hits.batch_size == (0, 3) and hits["observation"].shape == (0, 3, 1)
 
 
 @pytest.mark.parametrize("storage", STORAGES)

@@ -19,9 +19,9 @@ def flat_steps(tensordict: Any) -> TensorDictBase:
 
     Examples:
         >>> from tensordict import TensorDict
-        >>> flat_steps(TensorDict({}, [2, 7]))
+        >>> flat_steps(TensorDict({}, [2, 7]))  # doctest: +ELLIPSIS
         Traceback (most recent call last):
-        ValueError: expected flat steps, batch size [T]; got [2, 7]. Pass td.reshape(-1).
+        ValueError: expected flat steps, batch size [T]; got [2, 7]. Pass td.reshape(-1); ...
     """
     if not isinstance(tensordict, TensorDictBase):
         raise TypeError(
@@ -31,7 +31,8 @@ def flat_steps(tensordict: Any) -> TensorDictBase:
     if tensordict.ndim != 1:
         raise ValueError(
             f"expected flat steps, batch size [T]; got {list(tensordict.batch_size)}. "
-            "Pass td.reshape(-1)."
+            "Pass td.reshape(-1); a collector that fills the database itself needs "
+            "trajs_per_batch=n, traj_format='cat'."
         )
     if len(tensordict) == 0:
         raise ValueError("expected whole episodes, got a table with no step.")

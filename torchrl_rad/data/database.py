@@ -50,7 +50,8 @@ class ExpertDatabase(TensorDictReplayBuffer):
 
     ``deepcopy`` gives the same database and pickling passes a path, under which another process
     opens it memory-mapped: a policy that holds a database can be copied and sent to workers at no
-    cost.
+    cost. A collector fills it with ``replay_buffer=database``, ``trajs_per_batch=n`` and
+    ``traj_format="cat"``.
 
     Args:
         storage (Storage, optional): a lazy storage; its size is the capacity. Defaults to
