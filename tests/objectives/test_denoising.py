@@ -361,6 +361,15 @@ def test_overfits_a_tiny_batch(process, placement):
     assert sum(losses[-10:]) < 0.5 * sum(losses[:10])
 
 
+def test_torch_compile():
+    loss, td = make(), windows(6)
+    expected = run(loss, td)
+    compiled = run(torch.compile(loss, backend="eager"), td)
+    for key in loss.out_keys:
+        torch.testing.assert_close(compiled[key], expected[key])
+    torch._dynamo.reset()
+
+
 def test_bfloat16_autocast_is_close():
     loss, td = make(), windows(64)
     exact = run(loss, td)["loss_denoising"]

@@ -230,6 +230,15 @@ def test_overfits_a_tiny_batch():
     assert losses[-1] < 0.01 * losses[0]
 
 
+def test_torch_compile():
+    loss, td = make(), windows(6)
+    expected = loss(td)
+    compiled = torch.compile(loss, backend="eager")(td)
+    for key in loss.out_keys:
+        torch.testing.assert_close(compiled[key], expected[key])
+    torch._dynamo.reset()
+
+
 def test_bfloat16_autocast_is_close():
     loss, td = make(), windows(64)
     exact = loss(td)["loss_guidance"]

@@ -245,6 +245,15 @@ def test_overfits_a_tiny_batch(activation):
     assert torch.equal(loss.estimator(td.clone())["target_step"], td["target_step"])
 
 
+def test_torch_compile():
+    loss, td = make(), pairs(6)
+    expected = loss(td)
+    compiled = torch.compile(loss, backend="eager")(td)
+    for key in loss.out_keys:
+        torch.testing.assert_close(compiled[key], expected[key])
+    torch._dynamo.reset()
+
+
 def test_bfloat16_autocast_is_close():
     loss, td = make(), pairs(64)
     exact = loss(td)["loss_step"]
