@@ -575,6 +575,58 @@ def test_queries_see_whole_episodes(storage):
     assert len(database) == length * episodes
 
 
+@pytest.mark.parametrize("ask", ["retrieve", "digest", "window_max", "sample"])
+def test_nothing_is_read_between_a_new_length_and_its_rows(ask):
+    answers = []
+
+    class Slow(LazyTensorStorage):
+        asker = None
+
+        def _get_new_len(self, *args):
+            super()._get_new_len(*args)
+            if self.asker is not None:  # the storage is longer now, its new rows are not written
+                self.asker.start()
+                self.asker.join(0.5)
+                answers.append("too early" if not self.asker.is_alive() else "waits")
+
+    argument = {"retrieve": torch.zeros(1), "digest": None, "window_max": 5, "sample": 4}[ask]
+    sampler = RetrievalSampler("euclidean", k=3, threshold=0.0)
+    database = ExpertDatabase(Slow(10), gamma=1.0, sampler=sampler)
+    database.extend(make_steps([[1, 1]], offset=5.0))
+
+    def run():
+        answers.append(getattr(database, ask)(*(() if argument is None else (argument,))))
+
+    database.storage.asker = threading.Thread(target=run)
+    database.extend(make_steps([[1]]))
+    database.storage.asker.join()
+    assert answers[0] == "waits"
+    if ask == "retrieve":
+        assert answers[1]["index"].tolist() == [2, 0, 1]
+    elif ask == "digest":
+        assert answers[1] == database.digest()
+
+
+def test_nothing_is_written_during_a_query():
+    writers = []
+
+    class Interrupted(RetrievalSampler):
+        def search(self, storage, query):
+            writer = threading.Thread(target=database.extend, args=(make_steps([[1]]),))
+            writer.start()
+            writer.join(0.5)
+            writers.append((writer, len(storage)))
+            return super().search(storage, query)
+
+    sampler = Interrupted("euclidean", k=3, threshold=0.0)
+    database = ExpertDatabase(LazyTensorStorage(10), sampler=sampler)
+    database.extend(make_steps([[1, 1]]))
+    assert database.retrieve(torch.zeros(1))["index"].tolist() == [0, 1, -1]
+    ((writer, length),) = writers
+    writer.join()
+    assert length == 2 and len(database) == 3
+
+
 def test_threads_that_fill_get_ids_of_their_own():
     database = ExpertDatabase(LazyTensorStorage(1000))
 
