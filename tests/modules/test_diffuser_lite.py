@@ -10,7 +10,7 @@ from torchrl.data import LazyTensorStorage
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from torchrl_rad.data.database import ExpertDatabase
-from torchrl_rad.modules.diffuser_lite import DiffuserLitePlanner, plan_levels
+from torchrl_rad.modules.diffuser_lite import DiffuserLitePlanner
 from torchrl_rad.modules.inverse import InverseDynamics
 from torchrl_rad.modules.normalizer import Normalizer
 from torchrl_rad.modules.placement import PLACEMENTS
@@ -54,39 +54,7 @@ def at(planner, out, time):
     return out["plan"][..., planner.plan_times.tolist().index(time), :]
 
 
-# levels
-
-
-def test_plan_levels_by_hand():
-    assert plan_levels(129, (32, 8, 1)) == [(32, 5), (8, 5), (1, 9)]
-    assert plan_levels(49, [16, 4, 1]) == [(16, 4), (4, 5), (1, 5)]
-    assert plan_levels(9, (1,)) == [(1, 9)]
-    assert plan_levels(2, (1,)) == [(1, 2)]
-    assert [level.span for level in plan_levels(129, (32, 8, 1))] == [128, 32, 8]
-
-
-@pytest.mark.parametrize(
-    "horizon, jumps",
-    [
-        (128, (32, 8, 1)),  # 127 is no multiple of 32
-        (129, (32, 5, 1)),
-        (129, (32, 8)),
-        (129, (32, 32, 1)),
-        (129, (8, 32, 1)),
-        (129, ()),
-        (129, (32, 0, 1)),
-        (129, (-32, 8, 1)),
-        (129, (256, 1)),
-    ],
-)
-def test_jumps_that_do_not_multiply_out(horizon, jumps):
-    with pytest.raises(ValueError, match=rf"do not multiply out to horizon {horizon}: .* \(32, 8"):
-        plan_levels(horizon, jumps)
-
-
-def test_horizon_too_short():
-    with pytest.raises(ValueError, match="horizon is 1; a plan has 2 states or more"):
-        plan_levels(1, (1,))
+# the levels
 
 
 def test_plan_times():
@@ -249,8 +217,6 @@ def test_temperature_scales_the_noise():
 
 class LastState(torch.nn.Module):
     """Prefers plans that end far along the first dimension; keeps what it was shown."""
-
-    tokens = 5
 
     def forward(self, plans):
         self.plans = plans
@@ -464,6 +430,9 @@ def test_double_precision():
         ({"noise": "none"}, "noise is 'none'; expected 'sample', 'seeded' or 'zero'"),
         ({"process": "ddpm"}, "process is 'ddpm'; expected one of"),
         ({"placement": "ceil"}, "placement is 'ceil'; expected one of"),
+        ({"in_keys": ["observation"]}, "in_keys are .* expected five and two"),
+        ({"out_keys": ["plan"]}, "out_keys .* expected five and two"),
+        ({"targets": False, "in_keys": ["a", "b"]}, "expected one and two"),
         ({"jumps": (5, 1)}, "do not multiply out to horizon 13"),
         (
             {"return_model": ReturnModel(Normalizer.identity(DIM), 4)},

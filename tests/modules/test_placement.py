@@ -8,8 +8,9 @@ from tensordict import TensorDict
 from torchrl.data import LazyTensorStorage
 
 from torchrl_rad.data.database import ExpertDatabase
-from torchrl_rad.modules.diffuser_lite import DiffuserLitePlanner, plan_levels
+from torchrl_rad.modules.diffuser_lite import DiffuserLitePlanner
 from torchrl_rad.modules.inverse import InverseDynamics
+from torchrl_rad.modules.levels import plan_levels
 from torchrl_rad.modules.normalizer import Normalizer
 from torchrl_rad.modules.placement import PLACEMENTS, TargetPlacement
 from torchrl_rad.objectives import DenoisingLoss

@@ -1,8 +1,9 @@
 """TS, SE and PL as TensorDict modules."""
 
-from torchrl_rad.modules.diffuser_lite import DiffuserLitePlanner, plan_levels
+from torchrl_rad.modules.diffuser_lite import DiffuserLitePlanner
 from torchrl_rad.modules.dit import DiT
 from torchrl_rad.modules.inverse import InverseDynamics, inverse_dynamics_actor
+from torchrl_rad.modules.levels import plan_levels
 from torchrl_rad.modules.normalizer import Normalizer
 from torchrl_rad.modules.placement import TargetPlacement
 from torchrl_rad.modules.process import Diffusion, RectifiedFlow, make_process

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import pairwise
 from typing import Literal, NamedTuple
 
 import torch
@@ -16,49 +15,14 @@ from torchrl.envs.utils import ExplorationType, exploration_type
 from torchrl_rad.data.database import ExpertDatabase
 from torchrl_rad.modules.dit import DiT
 from torchrl_rad.modules.inverse import InverseDynamics
+from torchrl_rad.modules.levels import Level, plan_levels, plan_times
 from torchrl_rad.modules.normalizer import Normalizer
 from torchrl_rad.modules.placement import TargetPlacement
 from torchrl_rad.modules.process import make_process
 from torchrl_rad.modules.return_model import ReturnModel
 from torchrl_rad.modules.sampling import sample_plan
 
-__all__ = ["DiffuserLitePlanner", "Level", "plan_levels"]
-
-
-class Level(NamedTuple):
-    """One level of a plan: ``tokens`` states, ``jump`` steps apart."""
-
-    jump: int
-    tokens: int
-
-    @property
-    def span(self) -> int:
-        """Steps from the first state to the last one."""
-        return self.jump * (self.tokens - 1)
-
-
-def plan_levels(horizon: int, jumps: Sequence[int]) -> list[Level]:
-    """The levels of a plan of ``horizon`` states: each one refines the first jump of the one above.
-
-    Raises:
-        ValueError: the jumps do not multiply out to the horizon.
-
-    Examples:
-        >>> plan_levels(129, (32, 8, 1))
-        [Level(jump=32, tokens=5), Level(jump=8, tokens=5), Level(jump=1, tokens=9)]
-    """
-    if horizon < 2:
-        raise ValueError(f"horizon is {horizon}; a plan has 2 states or more.")
-    spans = [horizon - 1, *jumps]
-    fits = all(jump >= 1 and span % jump == 0 for span, jump in pairwise(spans))
-    fits = fits and all(jump > finer for jump, finer in pairwise(jumps))
-    if not jumps or jumps[-1] != 1 or not fits:
-        raise ValueError(
-            f"jumps {list(jumps)} do not multiply out to horizon {horizon}: horizon - 1 must be a "
-            "multiple of the first, each jump one of the next, and the last must be 1, as in "
-            "horizon 129 with jumps (32, 8, 1)."
-        )
-    return [Level(jump, span // jump + 1) for span, jump in pairwise(spans)]
+__all__ = ["DiffuserLitePlanner"]
 
 
 class Pin(NamedTuple):
@@ -172,25 +136,16 @@ class DiffuserLitePlanner(TensorDictModuleBase):
         out_keys: Sequence[NestedKey] = ("plan", "action"),
     ):
         super().__init__()
-        if steps < 1:
-            raise ValueError(f"steps is {steps}; a plan needs at least one inference step.")
-        if candidates < 1 or (candidates > 1 and return_model is None):
-            raise ValueError(
-                f"candidates is {candidates}: expected 1, or more and a return_model to rank them."
-            )
         levels = plan_levels(horizon, jumps)
-        if return_model is not None and return_model.tokens != levels[0].tokens:
-            raise ValueError(
-                f"the return model sees {return_model.tokens} states; the first level of these "
-                f"plans has {levels[0].tokens}."
-            )
-        if noise not in ("sample", "seeded", "zero"):
-            raise ValueError(f"noise is {noise!r}; expected 'sample', 'seeded' or 'zero'.")
-        if temperature < 0:
-            raise ValueError(f"temperature is {temperature}; it must not be negative.")
+        _check(steps, temperature, candidates, return_model, noise, levels)
         read = ["observation", "target", "found", "target_step", "target_index"]
         self.in_keys = list(in_keys) if in_keys is not None else read if targets else read[:1]
         self.out_keys = list(out_keys)
+        if len(self.in_keys) not in ((4, 5) if targets else (1,)) or len(self.out_keys) != 2:
+            raise ValueError(
+                f"in_keys are {self.in_keys} and out_keys {self.out_keys}; expected "
+                f"{'five' if targets else 'one'} and two, in the order of the table."
+            )
         self.levels, self.horizon, self.targets = levels, horizon, targets
         self.process, self.steps, self.temperature = make_process(process), steps, temperature
         self.candidates, self.noise = candidates, noise
@@ -202,7 +157,7 @@ class DiffuserLitePlanner(TensorDictModuleBase):
         self.networks = PlanNetworks(
             DiT(state_dim, level.tokens, width, heads, blocks) for level in self.levels
         )
-        self.register_buffer("plan_times", _plan_times(self.levels), persistent=False)
+        self.register_buffer("plan_times", plan_times(levels), persistent=False)
 
     @dispatch(auto_batch_size=False)
     @torch.no_grad()
@@ -322,9 +277,28 @@ class DiffuserLitePlanner(TensorDictModuleBase):
         return self.temperature * noise.repeat(rows, 1, 1)
 
 
-def _plan_times(levels: Sequence[Level]) -> Tensor:
-    """Steps from now of the states in a plan: the finest level, then what coarser ones add."""
-    times = torch.arange(levels[-1].tokens) * levels[-1].jump
-    for level in reversed(levels[:-1]):
-        times = torch.cat([times, torch.arange(2, level.tokens) * level.jump])
-    return times
+def _check(
+    steps: int,
+    temperature: float,
+    candidates: int,
+    return_model: nn.Module | None,
+    noise: str,
+    levels: Sequence[Level],
+) -> None:
+    """Raises ValueError for arguments of a planner that they cannot have."""
+    if steps < 1:
+        raise ValueError(f"steps is {steps}; a plan needs at least one inference step.")
+    if temperature < 0:
+        raise ValueError(f"temperature is {temperature}; it must not be negative.")
+    if candidates < 1 or (candidates > 1 and return_model is None):
+        raise ValueError(
+            f"candidates is {candidates}: expected 1, or more and a return_model to rank them."
+        )
+    tokens = getattr(return_model, "tokens", levels[0].tokens)
+    if tokens != levels[0].tokens:
+        raise ValueError(
+            f"the return model sees {tokens} states; the first level of these plans has "
+            f"{levels[0].tokens}."
+        )
+    if noise not in ("sample", "seeded", "zero"):
+        raise ValueError(f"noise is {noise!r}; expected 'sample', 'seeded' or 'zero'.")
