@@ -8,6 +8,7 @@ from tensordict import TensorDict
 from torchrl.data import LazyMemmapStorage, LazyTensorStorage, TensorDictReplayBuffer
 
 from torchrl_rad import RetrievalSampler
+from torchrl_rad.retrieval import search
 
 from ..oracle import neighbours, ranking
 
@@ -88,6 +89,17 @@ def test_outputs():
     # given below the threshold, too: 1 / (1 + 6)
     assert info["similarity"][0, 1, 0].item() == pytest.approx(1 / 7)
     assert found(made, [0.4]) == [0, 1, -1]  # no batch at all
+
+
+@pytest.mark.parametrize("backend", ["tree", "scan"])
+@pytest.mark.parametrize("entries", [1, 50, 1000])
+def test_many_queries_are_asked_in_parts(backend, entries, monkeypatch):
+    states = torch.randn(70, 2, generator=torch.Generator().manual_seed(0)).round(decimals=1)
+    made = buffer(states, backend=backend, k=9, capacity=70)
+    rows, near = made.sampler.nearest(made.storage, states)
+    monkeypatch.setattr(search, "SCAN_ENTRIES", entries)
+    again, other = made.sampler.nearest(made.storage, states)
+    assert torch.equal(rows, again) and torch.equal(near, other)
 
 
 def test_threshold_counts_as_near_enough():

@@ -19,6 +19,7 @@ from torchrl_rad.retrieval.rules import RankedRule, TolerantRule, followed_rule,
 __all__ = ["RetrievalTargetModule"]
 
 OUT_KEYS = ("target", "found", "similarity", "target_return", "target_index")
+QUERIES = 4096  # asked at a time: each has k neighbours
 KEPT = ("retrieval", "kept")  # float64 [*B, 4]: row, similarity, offset, age
 
 
@@ -119,7 +120,7 @@ class RetrievalTargetModule(TensorDictModuleBase):
             raise ValueError(
                 f"horizon is {horizon}; a target lies at least one step ahead: use 2 or more."
             )
-        if tolerance < 0:
+        if not tolerance >= 0:
             raise ValueError(f"tolerance is {tolerance}; it must not be negative.")
         if rule == "followed" and not 0 <= ahead < horizon:
             raise ValueError(f"ahead is {ahead}; expected 0 to horizon - 1 = {horizon - 1}.")
@@ -144,7 +145,7 @@ class RetrievalTargetModule(TensorDictModuleBase):
             self.out_keys += [("next", *KEPT)]
         self._columns: _Columns | None = None
 
-    @dispatch
+    @dispatch(auto_batch_size=False)  # of a state alone, all of its dims would be taken
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes the target of each row into ``tensordict`` and returns it.
 
@@ -201,6 +202,9 @@ class RetrievalTargetModule(TensorDictModuleBase):
             Row of the target (int64 [Q], -1 if none), similarity (float32 [Q]) and recorded offset
             (int64 [Q]).
         """
+        if len(query) > QUERIES:
+            parts = [self.select(part) for part in query.split(QUERIES)]
+            return tuple(torch.cat(column) for column in zip(*parts, strict=True))  # type: ignore
         database, device = self.database, query.device
         with database._replay_lock:
             rows, near = database.sampler.nearest(database.storage, query)  # [Q, k]
@@ -265,6 +269,9 @@ class RetrievalTargetModule(TensorDictModuleBase):
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "_columns": None}
 
-    def extra_repr(self) -> str:
+    def __repr__(self) -> str:
         names = ("rule", "horizon", "tolerance", "ahead", "min_offset", "retrieval_interval")
-        return ", ".join(f"{name}={getattr(self, name)!r}" for name in names)
+        settings = ", ".join(f"{name}={getattr(self, name)!r}" for name in names)
+        return (
+            f"RetrievalTargetModule({settings}, in_keys={self.in_keys}, out_keys={self.out_keys})"
+        )

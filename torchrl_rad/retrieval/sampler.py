@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 from torchrl.data.replay_buffers.samplers import Sampler
 
+from torchrl_rad.retrieval import search
 from torchrl_rad.retrieval.search import Metric, ScanIndex, TreeIndex, build_index
 
 __all__ = ["RetrievalSampler", "storage_revision"]
@@ -163,7 +164,12 @@ class RetrievalSampler(Sampler):
         whole = bool(finite.all())
         if not whole:
             query = torch.where(finite, query, 0.0)
-        near, rows = index.search(self._prepare(query), min(self.k, count))
+        query, k = self._prepare(query), min(self.k, count)
+        most = max(1, search.SCAN_ENTRIES // (k * max(1, query.shape[-1])))
+        parts = [index.search(part, k) for part in query.split(most)]
+        near, rows = parts[0]
+        if len(parts) > 1:
+            near, rows = (torch.cat(part) for part in zip(*parts, strict=True))
         if not whole:
             near, rows = torch.where(finite, near, -torch.inf), torch.where(finite, rows, -1)
         return rows, near

@@ -13,7 +13,7 @@ __all__ = ["Metric", "ScanIndex", "TreeIndex", "build_index", "similarity"]
 
 Metric = Literal["cosine", "euclidean"]
 
-SCAN_ENTRIES = 2**22  # similarities held at a time by a scan
+SCAN_ENTRIES = 2**22  # entries of states that a search compares at a time
 TREE_DIMS = 3  # beyond, a scan of k in the hundreds is faster
 
 
@@ -156,7 +156,7 @@ class TreeIndex:
         if np.isinf(distance[:, -1:]).any():  # too far for the tree, which then finds nothing
             return ScanIndex(self.rows, self.metric).search(query, k)
         index = torch.from_numpy(places)
-        near = self.rows.index_select(0, index.view(-1)).view(*index.shape, -1)
+        near = self.rows.index_select(0, index.view(-1)).view(*index.shape, self.rows.shape[-1])
         near, index = _order(similarity(query[:, None], near, self.metric), index, wanted)
         if wanted > k:
             # the tree is free in what it takes among rows as far as the last one: look around
