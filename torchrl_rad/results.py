@@ -78,8 +78,10 @@ def merge_results(folders: Sequence[str | Path]) -> dict[str, dict[str, Any]]:
         name -> figures, for :func:`format_table`.
 
     Raises:
-        CheckpointError: a folder has no results, or those of another task.
+        CheckpointError: no folders; or one has no results, or those of another task.
     """
+    if len(folders) == 0:
+        raise CheckpointError("no run folders to merge; pass one or more.")
     runs = [_read(Path(folder)) for folder in folders]
     tasks = {run["task"] for run in runs}
     if len(tasks) != 1:
@@ -93,7 +95,10 @@ def _read(folder: Path) -> dict[str, Any]:
         raise CheckpointError(
             f"{folder} has no results.json; its run failed or is not over (resume={folder})."
         )
-    return read_json(folder / "results.json")
+    results = read_json(folder / "results.json")
+    if not isinstance(results, dict) or not {"task", "rows"} <= results.keys():
+        raise CheckpointError(f"{folder / 'results.json'} is not of a run: no task or rows in it.")
+    return results
 
 
 def _merge(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:

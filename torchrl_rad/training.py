@@ -49,6 +49,9 @@ class Objective:
         ema (float, optional): decay of the target parameters; None if the loss has none.
         bf16 (bool, optional): compute the loss under bfloat16 autocast. Defaults to ``False``.
 
+    Raises:
+        ValueError: ``steps`` is below 1.
+
     Examples:
         >>> from torchrl_rad import Normalizer, StepEstimationLoss, StepEstimator, draw_step_pairs
         >>> from tensordict import TensorDict
@@ -69,6 +72,8 @@ class Objective:
     bf16: bool = False
 
     def __post_init__(self):
+        if self.steps < 1:
+            raise ValueError(f"steps is {self.steps}; expected 1 or more.")
         parameters = list(self.loss.parameters())
         self.optimizer = torch.optim.AdamW(
             parameters, lr=self.lr, weight_decay=self.weight_decay, fused=True
@@ -188,7 +193,11 @@ def train(
         CheckpointError: the checkpoint is damaged or of another run, or cannot be saved.
         FloatingPointError: a loss is NaN or Inf; the message names it and the step.
         Interrupted: it was asked to stop; what was done is saved.
+        ValueError: an interval is below 1.
     """
+    for interval, value in (("save_interval", save_interval), ("log_interval", log_interval)):
+        if value < 1:
+            raise ValueError(f"{interval} is {value}; expected 1 or more.")
     meter = Meter()
     parts: dict[str, Any] = {"meter": meter, "rng": GlobalRNGState()}
     for name, objective in objectives.items():
@@ -205,7 +214,7 @@ def train(
                 log(step, means)
                 bar.set_postfix_str(_short(means))
             bar.update()
-            stopped = stop.requested and step < steps
+            stopped = stop.requested
             if step % save_interval == 0 or step == steps or stopped:
                 checkpointer.save(step, parts, meta)
             if stopped:
