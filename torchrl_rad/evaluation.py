@@ -34,7 +34,7 @@ def evaluate(
         env (EnvBase): [n] rows, seeded.
         policy (callable): reads and writes a tensordict.
         max_steps (int): limit of an episode.
-        progress (callable, optional): called after each step.
+        progress (callable, optional): called at each step.
 
     Returns:
         TensorDict [n, T] with ``observation``, what TS and SE wrote, and under ``"next"``
@@ -50,6 +50,8 @@ def evaluate(
 
     def act(tensordict: TensorDictBase) -> TensorDictBase:
         acted = policy(tensordict)
+        if progress is not None:
+            progress()
         # plans of every step would fill the memory
         return acted.exclude("plan")
 
@@ -59,7 +61,6 @@ def evaluate(
             act,
             break_when_any_done=False,
             break_when_all_done=True,
-            callback=None if progress is None else lambda *_: progress(),
         )
     kept = [key for key in KEPT if key in steps.keys()]
     following = steps["next"].select("observation", "reward", "done")
@@ -76,7 +77,7 @@ def episode_results(steps: TensorDictBase) -> dict[str, np.ndarray]:
         Arrays [n]: ``return``; ``length``; ``success`` (a positive reward was earned); ``arrival``
         (the step of the first one, NaN if none); ``share`` (of the steps from there on that earned
         one, NaN if none); ``found`` and ``similarity`` (means over steps, where the policy
-        retrieves).
+        retrieves; over those that had a similarity, NaN if none).
 
     Examples:
         >>> reward = torch.tensor([[0.0, 1.0, 0.0, 1.0, 5.0]]).unsqueeze(-1)
@@ -105,8 +106,8 @@ def episode_results(steps: TensorDictBase) -> dict[str, np.ndarray]:
         results["found"] = (found & inside).sum(1) / length
         similarity = steps["similarity"].squeeze(-1).cpu().double().numpy()
         finite = np.isfinite(similarity) & inside
-        total = np.where(finite, similarity, 0.0).sum(1)
-        results["similarity"] = total / np.maximum(finite.sum(1), 1)
+        count = np.where(finite.any(1), finite.sum(1), np.nan)
+        results["similarity"] = np.where(finite, similarity, 0.0).sum(1) / count
     return results
 
 
