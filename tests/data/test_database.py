@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from tensordict import TensorDict
 from torchrl.collectors import Collector
-from torchrl.data import LazyMemmapStorage, LazyTensorStorage
+from torchrl.data import LazyMemmapStorage, LazyTensorStorage, ListStorage
 from torchrl.data.replay_buffers import Sequence
 from torchrl.data.replay_buffers.samplers import RandomSampler
 from torchrl.envs import SerialEnv, StepCounter, TransformedEnv
@@ -353,6 +353,12 @@ def test_foreign_sampler():
         ExpertDatabase(LazyTensorStorage(9), sampler=RandomSampler())
 
 
+@pytest.mark.parametrize("storage", [ListStorage(9), 9, make_steps([[1]])])
+def test_foreign_storage(storage):
+    with pytest.raises(TypeError, match="storage must be a LazyTensorStorage .*, got "):
+        ExpertDatabase(storage)
+
+
 # asking
 
 
@@ -469,6 +475,18 @@ def test_window_max_follows_changes():
     assert database.window_max(3).max(low, high).tolist() == [1]
     database.extend(make_steps([[7, 9]]))
     assert database.window_max(3).max(low + 3, high + 3).tolist() == [9]
+
+
+@pytest.mark.parametrize("storage", STORAGES)
+def test_state_dict_brings_rows_and_drops_what_was_known_of_others(storage):
+    database, other = make_database([[1, 1, 1]], storage), make_database([[0, 2, 0]], storage)
+    other[:]["observation"].add_(10.0)
+    assert database.retrieve(torch.tensor([10.0]))["index"].tolist() == [2, 1, 0]
+    database.window_max(2)
+    database.load_state_dict(other.state_dict())
+    assert database.digest() == other.digest()
+    assert database.retrieve(torch.tensor([10.0]))["index"].tolist() == [0, 1, 2]
+    assert database.window_max(2).values.tolist() == other[:]["return_to_go"].tolist()
 
 
 # identity

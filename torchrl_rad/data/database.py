@@ -63,7 +63,7 @@ class ExpertDatabase(TensorDictReplayBuffer):
 
     Raises:
         ValueError: ``gamma`` lies outside [0, 1].
-        TypeError: ``sampler`` is no RetrievalSampler.
+        TypeError: ``sampler`` is no RetrievalSampler, or ``storage`` holds no tensors.
 
     Examples:
         >>> from tensordict import TensorDict
@@ -93,6 +93,11 @@ class ExpertDatabase(TensorDictReplayBuffer):
             raise ValueError(f"gamma is {gamma}; a discount lies in [0, 1].")
         if sampler is not None and not isinstance(sampler, RetrievalSampler):
             raise TypeError(f"sampler must be a RetrievalSampler, got {type(sampler).__name__}.")
+        if storage is not None and not isinstance(storage, TensorStorage):
+            raise TypeError(
+                "storage must be a LazyTensorStorage or a LazyMemmapStorage, got "
+                f"{type(storage).__name__}."
+            )
         super().__init__(
             storage=LazyTensorStorage(1_000_000) if storage is None else storage,
             sampler=RetrievalSampler() if sampler is None else sampler,
