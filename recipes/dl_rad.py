@@ -39,7 +39,7 @@ from torchrl_rad.plots import plot_curves, plot_targets
 from torchrl_rad.policy import save_policy
 from torchrl_rad.results import SCORE_SOURCE, format_table
 from torchrl_rad.runs import RunFolder
-from torchrl_rad.training import Interrupted, Objective, bf16_wins, train
+from torchrl_rad.training import Interrupted, Objective, train, uses_bf16
 
 ERRORS = (CheckpointError, FileNotFoundError, FloatingPointError, KeyError, ValueError)
 
@@ -50,7 +50,7 @@ def make_objectives(cfg: dict[str, Any], policies: dict[str, PolicyParts], train
     backbone = policies[BACKBONE].policy[-1]
     optim, network, loss = cfg["optim"], cfg["network"], cfg["loss"]
     steps, head = optim["gradient_steps"], {"lr": optim["head_lr"], "warmup": optim["warmup"]}
-    bf16 = {"auto": bf16_wins(cfg["device"]), "bf16": True, "fp32": False}[optim["precision"]]
+    bf16 = uses_bf16(optim["precision"], cfg["device"])
 
     def denoising(planner) -> Objective:
         module = DenoisingLoss(

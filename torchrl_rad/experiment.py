@@ -11,6 +11,7 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictSequential
 from torchrl.data import LazyTensorStorage
+from torchrl.envs import EnvBase
 from torchrl.record.loggers import get_logger
 from tqdm import tqdm
 
@@ -28,6 +29,7 @@ from torchrl_rad.policy import build_policy, fit_scales
 from torchrl_rad.results import SCORE_SOURCE
 from torchrl_rad.retrieval import RetrievalSampler
 from torchrl_rad.runs import RunFolder, environment_facts
+from torchrl_rad.training import uses_bf16
 
 __all__ = [
     "BACKBONE",
@@ -169,22 +171,39 @@ def step_error(policy: TensorDictSequential, windows: TensorDictBase) -> float:
 
 
 def collect_episodes(
-    task: MazeTask,
+    env: EnvBase,
     policy: TensorDictSequential,
-    episodes: int,
+    max_steps: int,
     seed: int,
     name: str = "policy",
-    goal_cell: tuple[int, int] | None = None,
+    bf16: bool = False,
     progress: bool = True,
 ) -> TensorDictBase:
-    """The first episode of each of ``episodes`` rows of the task; same seed, same episodes."""
-    env = make_maze_env(task, episodes, seed, goal_cell)
+    """The first episode of each row of an environment; same seed, same episodes.
+
+    Args:
+        env (EnvBase): [n] rows, as of :func:`~torchrl_rad.envs.make_maze_env`.
+        policy (TensorDictSequential): what acts.
+        max_steps (int): limit of an episode.
+        seed (int): of the start states and of the policy's noise.
+        name (str, optional): shown beside the progress bar.
+        bf16 (bool, optional): plan under bfloat16 autocast. Defaults to ``False``.
+        progress (bool, optional): show a bar. Defaults to ``True``.
+
+    Returns:
+        See :func:`~torchrl_rad.evaluation.evaluate`.
+    """
+
+    def act(tensordict: TensorDictBase) -> TensorDictBase:
+        with torch.autocast(tensordict["observation"].device.type, torch.bfloat16, bf16):
+            tensordict = policy(tensordict)
+        return tensordict.set("action", tensordict["action"].float())
+
+    env.set_seed(seed)
     torch.manual_seed(seed)
-    bar = tqdm(total=task.max_steps, desc=f"evaluating {name}", unit="step", disable=not progress)
+    bar = tqdm(total=max_steps, desc=f"evaluating {name}", unit="step", disable=not progress)
     with bar:
-        steps = evaluate(env, policy, task.max_steps, progress=bar.update)
-    env.close()
-    return steps
+        return evaluate(env, act, max_steps, progress=bar.update)
 
 
 def make_logger(run: RunFolder, cfg: Mapping[str, Any]) -> Callable[[int, dict[str, float]], None]:
@@ -234,12 +253,15 @@ def evaluate_policies(
     windows = window_sampler(data, cfg["network"]["horizon"], 4096)()
     rows: dict[str, dict[str, Any]] = {}
     episodes: dict[str, TensorDictBase] = {}
+    env = None  # a maze costs some 13 MB a row: one environment serves all policies
     for name, parts in policies.items():
         steps = run.load_episodes(name)
         if steps is None:
             seed = settings["seed"] + cfg["seed"]
+            env = make_maze_env(task, settings["episodes"]) if env is None else env
+            bf16 = uses_bf16(cfg["optim"]["precision"], cfg["device"])
             steps = collect_episodes(
-                task, parts.policy, settings["episodes"], seed, name, progress=progress
+                env, parts.policy, task.max_steps, seed, name, bf16, progress=progress
             )
             run.save_episodes(name, steps)
         episodes[name] = steps

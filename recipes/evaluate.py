@@ -1,0 +1,45 @@
+"""Scores a saved policy on its task.
+
+python recipes/evaluate.py outputs/pointmaze-umaze/<run>/policies/followed --episodes 100
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+
+import torch
+
+from torchrl_rad import make_maze_env, maze_task
+from torchrl_rad.checkpoint import CheckpointError, read_json
+from torchrl_rad.experiment import collect_episodes, policy_row
+from torchrl_rad.policy import load_policy
+from torchrl_rad.results import SCORE_SOURCE, format_table
+from torchrl_rad.training import uses_bf16
+
+
+def main() -> None:
+    """Reads the command line; errors that a user can mend end in one line."""
+    parser = argparse.ArgumentParser(description="Scores a saved policy on its task.")
+    parser.add_argument("folder", help="policy folder, such as <run folder>/policies/followed")
+    parser.add_argument("--episodes", type=int, default=100, help="rows, one episode each")
+    parser.add_argument("--seed", type=int, default=10_000, help="of start states and noise")
+    parser.add_argument("--threads", type=int, default=2)
+    parser.add_argument("--precision", default="auto", choices=("auto", "bf16", "fp32"))
+    arguments = parser.parse_args()
+    torch.set_num_threads(arguments.threads)
+    try:
+        policy = load_policy(arguments.folder)
+        task = maze_task(read_json(f"{arguments.folder}/policy.json")["maze"])
+    except (CheckpointError, FileNotFoundError, KeyError) as error:
+        sys.exit(f"error: {error.args[0] if isinstance(error, KeyError) else error}")
+    env = make_maze_env(task, arguments.episodes)
+    bf16 = uses_bf16(arguments.precision)
+    steps = collect_episodes(env, policy, task.max_steps, arguments.seed, task.name, bf16)
+    low, high = task.reference_scores
+    print(format_table({task.name: policy_row(task, policy, steps)}))
+    print(f"\n{SCORE_SOURCE.format(low=low, high=high)}")
+
+
+if __name__ == "__main__":
+    main()
