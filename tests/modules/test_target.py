@@ -241,23 +241,24 @@ def test_states_on_another_device(rule, rows_on):
     assert torch.equal(out["target_index"].cpu(), expected["target_index"])
 
 
-def test_a_query_sees_whole_episodes_only():
-    made = database(episodes(torch.zeros(5, 1), [5]), capacity=5 * 61, k=500, threshold=0.0)
-    select = module(made, horizon=5)
+def test_nothing_is_added_between_the_search_and_the_reading(monkeypatch):
+    made = database(walks())
+    select = module(made)
+    free = []
 
-    def fill():
-        for number in range(60):  # each pays more than those before it, and in its last row
-            rewards = [0.0] * 4 + [number + 1.0]
-            made.extend(episodes(torch.full((5, 1), float(number)), [5], rewards))
+    def watched(function):
+        def call(*args):
+            other = threading.Thread(target=lambda: free.append(made._replay_lock.acquire(False)))
+            other.start()
+            other.join()
+            return function(*args)
 
-    filling = threading.Thread(target=fill)
-    filling.start()
-    seen = set()
-    while filling.is_alive():
-        out = ask(select, [[0.0]])
-        seen.add((out["target_index"].item(), out["target_return"].item()))
-    filling.join()
-    assert seen and all(index == 5 * worth + 4 for index, worth in seen if worth)
+        return call
+
+    monkeypatch.setattr(made.sampler, "nearest", watched(made.sampler.nearest))
+    monkeypatch.setattr(select, "_read", watched(select._read))
+    ask(select, queries())
+    assert free == [False, False]  # extend, which takes this lock, would have to wait
 
 
 # keys and errors
@@ -482,6 +483,12 @@ def test_only_a_target_is_kept():
     assert out["target_index"].tolist() == [[2], [-1]] and out["target"][1] == 0
     out, after = kept(select, [[4.0], [4.0]], [False, False], after)
     assert out["target_index"].tolist() == [[2], [4]]
+
+
+def test_what_was_never_asked_is_not_kept():
+    # as the primer left it, without a reset: row 0 is no target
+    out, after = kept(module(places(), retrieval_interval=5), [[7.0]], [False])
+    assert out["target_index"] == 7 and after.tolist() == [[7.0, 1.0, 0.0, 1.0]]
 
 
 def test_rows_that_are_gone_are_not_kept():
