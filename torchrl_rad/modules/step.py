@@ -44,6 +44,8 @@ class StepEstimator(TensorDictModuleBase):
             against the rest, as the paper prints it. Defaults to ``"softmax"``.
         estimate (str, optional): ``"mode"``, ``"median"`` or ``"mean"`` of the classes, or
             ``"recorded"``. Defaults to ``"mode"``.
+        pace (float, optional): the steps are multiplied by it and rounded, 1 at least. Below 1 it
+            asks the planner to arrive sooner than the demonstrations did. Defaults to ``1.0``.
         in_keys (sequence of NestedKey, optional): state and target, and the offset if
             ``"recorded"``.
         out_keys (sequence of NestedKey, optional): the steps; a second one asks for the logits.
@@ -67,10 +69,13 @@ class StepEstimator(TensorDictModuleBase):
         width: int = 256,
         activation: Literal["softmax", "sigmoid"] = "softmax",
         estimate: Literal["mode", "median", "mean", "recorded"] = "mode",
+        pace: float = 1.0,
         in_keys: Sequence[NestedKey] | None = None,
         out_keys: Sequence[NestedKey] = ("target_step",),
     ):
         super().__init__()
+        if not pace > 0:
+            raise ValueError(f"pace is {pace}; expected a positive factor, 1 for no change.")
         if horizon < 2:
             raise ValueError(f"horizon is {horizon}; a step estimate needs 2 or more.")
         if activation not in ("softmax", "sigmoid"):
@@ -83,6 +88,7 @@ class StepEstimator(TensorDictModuleBase):
             in_keys = ["observation", "target"] + ["target_offset"] * (estimate == "recorded")
         self.in_keys, self.out_keys = list(in_keys), list(out_keys)
         self.horizon, self.activation, self.estimate = horizon, activation, estimate
+        self.pace = pace
         self.normalizer = normalizer
         self.net = nn.Sequential(
             nn.Linear(2 * len(normalizer.mean), width), nn.SiLU(),
@@ -105,17 +111,22 @@ class StepEstimator(TensorDictModuleBase):
                     f"{self.in_keys[2]!r} is missing in the tensordict; estimate='recorded' reads "
                     "it: RetrievalTargetModule writes it where it is its sixth out_key."
                 )
-            tensordict.set(self.out_keys[0], offset.clamp(1, self.horizon - 1))
+            tensordict.set(self.out_keys[0], self._paced(offset))
         if not recorded or len(self.out_keys) > 1:
             # a state with NaN has itself, without them, as its target
             state = self.normalizer.read(tensordict, self.in_keys[0])
             state = torch.nan_to_num(state, nan=0.0, posinf=0.0, neginf=0.0)
             logits = self.logits(state, self.normalizer.read(tensordict, self.in_keys[1]))
             if not recorded:
-                tensordict.set(self.out_keys[0], self._steps(logits))
+                tensordict.set(self.out_keys[0], self._paced(self._steps(logits)))
             if len(self.out_keys) > 1:
                 tensordict.set(self.out_keys[1], logits)
         return tensordict
+
+    def _paced(self, steps: Tensor) -> Tensor:
+        if self.pace != 1.0:
+            steps = (steps * self.pace).round().long()
+        return steps.clamp(1, self.horizon - 1)
 
     def _steps(self, logits: Tensor) -> Tensor:
         if self.estimate in ("mode", "recorded"):
