@@ -363,7 +363,7 @@ def test_foreign_storage(storage):
 
 
 @pytest.mark.parametrize("storage", STORAGES)
-@pytest.mark.parametrize("shape", [(), (4,), (2, 3), (2, 1, 2)])
+@pytest.mark.parametrize("shape", [(), (4,), (2, 3), (2, 1, 2), (0,)])
 def test_retrieve_shapes(storage, shape):
     database = make_database([[0, 1, 0]], storage)
     hits = database.retrieve(torch.ones(*shape, 1))
