@@ -154,7 +154,7 @@ def measure_latency(
     Args:
         policy (TensorDictSequential): TS, SE and PL, or PL alone.
         states (Tensor): [n, T, S], episodes that the policy drove; consecutive ones are asked for,
-            as in acting.
+            as in acting, on the policy's device.
         rows (int): states of a call, at most n.
         calls (int, optional): timed calls, after five that are not. Defaults to ``50``.
 
@@ -162,6 +162,8 @@ def measure_latency(
         For each module (named by its class) and ``"total"``: ``p50`` and ``p95``.
     """
     names = [type(module).__name__ for module in policy.module]
+    weight = next(policy.parameters(), None)
+    states = states if weight is None else states.to(weight.device)
     spent = np.zeros((calls + 5, len(names)))
     for call in range(calls + 5):
         tensordict = TensorDict({"observation": states[:rows, call % states.shape[1]]}, [rows])

@@ -24,7 +24,8 @@ def _pyplot():
         import matplotlib
     except ImportError as error:
         raise ImportError(
-            'plots need matplotlib: pip install "torchrl_rad[recipes]", or pass plots=false.'
+            'plots need matplotlib: pip install "torchrl_rad[recipes]"; a run goes on with resume='
+            "<run folder>, and does nothing twice."
         ) from error
     matplotlib.use("Agg", force=False)
     from matplotlib import pyplot
@@ -41,10 +42,13 @@ def plot_curves(rows: Sequence[Mapping[str, float]], path: str | Path) -> None:
 
     Raises:
         ImportError: matplotlib is not installed.
+        ValueError: nothing was logged.
     """
     pyplot = _pyplot()
+    names = sorted({key.split("/")[0] for row in rows[:1] for key in row if "/" in key})
+    if not names:
+        raise ValueError("nothing was logged, so there are no curves to draw.")
     steps = [row["step"] for row in rows]
-    names = sorted({key.split("/")[0] for key in rows[0] if "/" in key})
     figure, axes = pyplot.subplots(1, len(names), figsize=(3.2 * len(names), 2.8), squeeze=False)
     for axis, name in zip(axes[0], names, strict=True):
         for key in sorted(key for key in rows[0] if key.startswith(f"{name}/")):
@@ -137,7 +141,7 @@ def _draw_plans(axis: Any, policy: TensorDictSequential, steps: TensorDictBase) 
     paid = steps["next", "reward"].squeeze(-1) > 0
     way = int(paid.int().argmax()) if paid.any() else len(paid) - 1
     at = torch.linspace(0, max(way, 1), 5).long()[:-1]
-    states = steps["observation"][at]
+    states = steps["observation"][at].to(next(policy.parameters()).device)
     with torch.no_grad():
         plans = policy(TensorDict({"observation": states}, [len(states)]))["plan"]
     for plan in plans.cpu().numpy():
