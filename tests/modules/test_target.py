@@ -578,3 +578,9 @@ def test_collector_with_a_worker_process(by_factory, tmp_path):
     assert len(batches) == 2
     for batch in batches:
         check(batch, made)
+
+
+def test_a_primer_only_where_something_is_kept():
+    database = ExpertDatabase(LazyTensorStorage(10))
+    assert not hasattr(RetrievalTargetModule(database), "make_tensordict_primer")
+    assert hasattr(RetrievalTargetModule(database, retrieval_interval=2), "make_tensordict_primer")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, Literal, NamedTuple
 
 import torch
@@ -258,11 +258,17 @@ class RetrievalTargetModule(TensorDictModuleBase):
         tensordict.set(("next", *KEPT), state.reshape(kept.shape))
         return state[:, 0].long(), state[:, 1].float(), state[:, 2].long()
 
-    def make_tensordict_primer(self) -> TensorDictPrimer:
-        """The environment transform that carries what is kept from step to step.
+    @property
+    def make_tensordict_primer(self) -> Callable[[], TensorDictPrimer]:
+        """Makes the environment transform that carries what is kept from step to step.
 
-        Needed where ``retrieval_interval`` is larger than 1.
+        Absent where ``retrieval_interval`` is 1: a collector asks every module that has it.
         """
+        if self.retrieval_interval == 1:
+            raise AttributeError("make_tensordict_primer: retrieval_interval=1 keeps nothing")
+        return self._primer
+
+    def _primer(self) -> TensorDictPrimer:
         spec = Unbounded((4,), dtype=torch.float64)
         return TensorDictPrimer({KEPT: spec}, default_value=0.0, expand_specs=True)
 
