@@ -8,12 +8,15 @@ python recipes/dl_rad.py resume=outputs/pointmaze-umaze/<run>
 from __future__ import annotations
 
 import datetime
+import logging
 import sys
+import warnings
 from typing import Any
 
 import hydra
 import torch
 from omegaconf import DictConfig, OmegaConf
+from torchrl._utils import logger as torchrl_logger
 from torchrl.objectives import BCLoss
 
 from torchrl_rad import (
@@ -40,6 +43,9 @@ from torchrl_rad.policy import save_policy
 from torchrl_rad.results import SCORE_SOURCE, format_table
 from torchrl_rad.runs import RunFolder
 from torchrl_rad.training import Interrupted, Objective, train, uses_bf16
+
+torchrl_logger.setLevel(logging.WARNING)
+warnings.filterwarnings("ignore", "The name target_actor_network_params")  # of TorchRL's BCLoss
 
 ERRORS = (CheckpointError, FileNotFoundError, FloatingPointError, KeyError, ValueError)
 

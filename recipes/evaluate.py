@@ -6,9 +6,11 @@ python recipes/evaluate.py outputs/pointmaze-umaze/<run>/policies/followed --epi
 from __future__ import annotations
 
 import argparse
+import logging
 import sys
 
 import torch
+from torchrl._utils import logger as torchrl_logger
 
 from torchrl_rad import make_maze_env, maze_task
 from torchrl_rad.checkpoint import CheckpointError, read_json
@@ -16,6 +18,8 @@ from torchrl_rad.experiment import collect_episodes, policy_row
 from torchrl_rad.policy import load_policy
 from torchrl_rad.results import SCORE_SOURCE, format_table
 from torchrl_rad.training import uses_bf16
+
+torchrl_logger.setLevel(logging.WARNING)
 
 
 def main() -> None:

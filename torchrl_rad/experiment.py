@@ -193,11 +193,12 @@ def collect_episodes(
     Returns:
         See :func:`~torchrl_rad.evaluation.evaluate`.
     """
+    device = next(policy.parameters()).device
 
     def act(tensordict: TensorDictBase) -> TensorDictBase:
-        with torch.autocast(tensordict["observation"].device.type, torch.bfloat16, bf16):
-            tensordict = policy(tensordict)
-        return tensordict.set("action", tensordict["action"].float())
+        with torch.autocast(device.type, torch.bfloat16, bf16):
+            acted = policy(tensordict.to(device))
+        return acted.set("action", acted["action"].float()).to("cpu")  # where the mazes are
 
     env.set_seed(seed)
     torch.manual_seed(seed)
