@@ -16,7 +16,9 @@ import signal
 import subprocess
 import sys
 import time
+import warnings
 from contextlib import redirect_stderr, redirect_stdout
+from importlib.metadata import version
 from pathlib import Path
 from unittest import mock
 
@@ -71,10 +73,11 @@ def elsewhere(tmp_path, monkeypatch):
 def call(name, *arguments):
     """Runs a recipe in this process: its exit code, what it prints and what it says of errors."""
     out, err = io.StringIO(), io.StringIO()
-    threads, root = torch.get_num_threads(), logging.getLogger()
-    before = root.level, root.handlers[:]
+    threads, loggers = torch.get_num_threads(), [logging.getLogger(), logging.getLogger("torchrl")]
+    before = [(logger, logger.level, logger.handlers[:]) for logger in loggers]
     try:
         with (
+            warnings.catch_warnings(),
             mock.patch.object(sys, "argv", [str(RECIPES / name), *arguments]),
             redirect_stdout(out),
             redirect_stderr(err),
@@ -88,7 +91,9 @@ def call(name, *arguments):
             code = 1
     finally:
         torch.set_num_threads(threads)
-        root.level, root.handlers[:] = before
+        for logger, level, handlers in before:  # hydra and the recipe set them up
+            logger.setLevel(level)
+            logger.handlers[:] = handlers
     return code, out.getvalue(), err.getvalue()
 
 
@@ -105,7 +110,7 @@ def whole(tmp_path_factory):
     """A run in a process of its own that nothing interrupts: its folder and what it printed."""
     base = tmp_path_factory.mktemp("whole")
     command = [sys.executable, str(RECIPES / "dl_rad.py"), *SMALL, f"folder={base / 'run'}"]
-    ran = subprocess.run(command, capture_output=True, text=True, cwd=base, timeout=280)
+    ran = subprocess.run(command, capture_output=True, text=True, cwd=base)
     assert ran.returncode == 0, ran.stderr
     return RunFolder.open(base / "run"), ran.stdout
 
@@ -152,7 +157,7 @@ def test_results(whole):
     results = run.results()
     assert results["task"] == "pointmaze-umaze" and results["seed"] == 0
     assert results["threads"] == 1
-    assert results["versions"]["torch"] == torch.__version__
+    assert results["versions"]["torch"] == version("torch")
     assert "dl_rad.py threads=1" in results["command"]
     assert tuple(results["rows"]) == POLICIES
     for name, row in results["rows"].items():
@@ -184,7 +189,8 @@ def test_all_policies_start_from_the_same_states(whole):
 def test_policies_load(whole):
     policies = {name: load_policy(whole[0].path / "policies" / name) for name in POLICIES}
     (backbone,), (select, *_), (other, _, planner) = policies.values()
-    assert (select.rule, other.rule, other.ahead) == ("highest", "followed", 16)
+    target = whole[0].config()["retrieval"]["followed"]["target"]
+    assert (select.rule, other.rule, other.ahead) == ("highest", "followed", target["ahead"])
     # one training serves both rules, and the backbone's heads are those of the planner
     weights = policies["paper"].state_dict()
     for key, value in policies["followed"].state_dict().items():
@@ -230,15 +236,12 @@ def latest(folder):
 
 
 def wait_for_checkpoint(process, folder, beyond):
-    limit = time.monotonic() + 250
     while process.poll() is None and latest(folder)[1] <= beyond:
-        assert time.monotonic() < limit, "no checkpoint came"
         time.sleep(0.002)
 
 
-@pytest.mark.parametrize("seed", [0])
-def test_killed_twice(tmp_path, whole, seed):
-    rng, folder = random.Random(seed), tmp_path / "run"
+def test_killed_twice(tmp_path, whole):
+    rng, folder = random.Random(0), tmp_path / "run"
     arguments = [*SMALL, f"folder={folder}"]
     for _ in range(2):
         process = start(*arguments)
@@ -263,7 +266,7 @@ def test_interrupted(tmp_path, whole):
     process = start(*SMALL, f"folder={folder}")
     wait_for_checkpoint(process, folder, 0)
     process.send_signal(signal.SIGINT)
-    _, err = process.communicate(timeout=120)
+    _, err = process.communicate()
     assert process.returncode == 130, err
     step = int(re.search(r"stopped and saved at step (\d+); go on with:", err)[1])
     assert latest(folder)[0] == step
@@ -278,7 +281,7 @@ def test_interrupted(tmp_path, whole):
         assert (episodes == expected).all()
 
 
-def test_resumed_run_of_an_other_task(tmp_path, whole):
+def test_resumed_run_of_another_task(tmp_path, whole):
     folder = tmp_path / "run"
     shutil.copytree(whole[0].path / "checkpoints", folder / "checkpoints")
     config = whole[0].config()
