@@ -145,8 +145,9 @@ def main_run(run: RunFolder, cfg: dict[str, Any], resume: bool) -> None:
         parts.policy.to(cfg["device"])
     for name, parts in policies.items():
         if parts.database is not None:
-            kept = len(parts.database[:]["episode"].unique())
-            print(f"{name}: {kept} episodes, {len(parts.database)} rows", flush=True)
+            total, kept = (len(t["episode"].unique()) for t in (data, parts.database[:]))
+            share = f"{kept} of {total} episodes ({kept / total:.1%})"
+            print(f"{name}: {share}, {len(parts.database)} rows", flush=True)
     data = data.to(cfg["device"]) if cfg["device"] != "cpu" else data
     run_training(run, cfg, policies, data, resume)
     rows, episodes = evaluate_policies(run, cfg, task, policies, data)

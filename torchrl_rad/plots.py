@@ -138,11 +138,13 @@ def _longest(steps: TensorDictBase, rows: range) -> int:
 
 
 def _draw_plans(axis: Any, policy: TensorDictSequential, steps: TensorDictBase) -> None:
+    """Plans at four places of an episode, as far as they are refined by finer levels."""
     paid = steps["next", "reward"].squeeze(-1) > 0
     way = int(paid.int().argmax()) if paid.any() else len(paid) - 1
     at = torch.linspace(0, max(way, 1), 5).long()[:-1]
     states = steps["observation"][at].to(next(policy.parameters()).device)
     with torch.no_grad():
         plans = policy(TensorDict({"observation": states}, [len(states)]))["plan"]
-    for plan in plans.cpu().numpy():
+    near = policy[-1].plan_times <= policy[-1].levels[0].jump
+    for plan in plans[:, near].cpu().numpy():
         axis.plot(*plan[:, :2].T, "-o", color=PLAN, lw=1.4, ms=2.5, label="plan")
