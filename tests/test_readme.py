@@ -8,9 +8,8 @@ ROOT = Path(__file__).parents[1]
 IMPORTS = """
 import torch
 from tensordict.nn import NormalParamExtractor, TensorDictModule, TensorDictSequential
-from torch import nn
 from torchrl.collectors import Collector
-from torchrl.modules import ProbabilisticActor, TanhNormal
+from torchrl.modules import MLP, ProbabilisticActor, TanhNormal
 from torchrl_rad import *
 """
 

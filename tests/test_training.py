@@ -183,12 +183,13 @@ def test_second_interrupt_stops_at_once(tmp_path):
         os.kill(os.getpid(), signal.SIGINT)
         os.kill(os.getpid(), signal.SIGINT)
 
+    before = signal.getsignal(signal.SIGINT)
     attempt = Attempt(tmp_path, twice, 2)
     with pytest.raises(KeyboardInterrupt) as caught:
         attempt.run()
     assert not isinstance(caught.value, Interrupted)
     assert attempt.checkpointer.latest() is None
-    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    assert signal.getsignal(signal.SIGINT) is before
 
 
 def test_second_terminate_still_saves(tmp_path):
