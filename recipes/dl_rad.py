@@ -47,7 +47,8 @@ from torchrl_rad.training import Interrupted, Objective, train, uses_bf16
 torchrl_logger.setLevel(logging.WARNING)
 warnings.filterwarnings("ignore", "The name target_actor_network_params")  # of TorchRL's BCLoss
 
-ERRORS = (CheckpointError, FileNotFoundError, FloatingPointError, KeyError, ValueError)
+# what a user can mend; OSError is a full disk or a folder that cannot be written
+ERRORS = (CheckpointError, FloatingPointError, ImportError, KeyError, OSError, ValueError)
 
 
 def make_objectives(cfg: dict[str, Any], policies: dict[str, PolicyParts], trained: str):
@@ -133,6 +134,8 @@ def run_training(run: RunFolder, cfg: dict[str, Any], policies, data, resume: bo
 
 def main_run(run: RunFolder, cfg: dict[str, Any], resume: bool) -> None:
     """The whole of a run, from the data to the table."""
+    if cfg["device"].startswith("cuda") and not torch.cuda.is_available():
+        raise ValueError(f"device is {cfg['device']!r}, but torch sees no GPU; use device=cpu.")
     torch.set_num_threads(cfg["threads"])
     torch.manual_seed(cfg["seed"])  # fresh weights are the same when resumed
     print(f"run folder: {run.path}", flush=True)
@@ -163,19 +166,20 @@ def main_run(run: RunFolder, cfg: dict[str, Any], resume: bool) -> None:
 def main(config: DictConfig) -> None:
     """Reads the command line; errors that a user can mend end in one line."""
     cfg = OmegaConf.to_container(config, resolve=True)
+    resume = cfg["resume"] is not None
     try:
-        if cfg["resume"] is not None:
+        if resume:
             run = RunFolder.open(cfg["resume"])
-            resumed = run.config()
-            resumed["logger"]["progress"] = cfg["logger"]["progress"]
-            main_run(run, resumed, resume=True)
-            return
-        date = datetime.datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
-        folder = cfg["folder"] or f"outputs/{cfg['env']['name']}/{date}-seed{cfg['seed']}"
-        run = RunFolder.create(folder, cfg)
-        main_run(run, cfg, resume=False)
-    except Interrupted as stop:
-        print(f"\nstopped and saved at step {stop.args[0]}; go on with:", file=sys.stderr)
+            progress, cfg = cfg["logger"]["progress"], run.config()
+            cfg["logger"]["progress"] = progress
+        else:
+            date = datetime.datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
+            folder = cfg["folder"] or f"outputs/{cfg['env']['name']}/{date}-seed{cfg['seed']}"
+            run = RunFolder.create(folder, cfg)
+        main_run(run, cfg, resume)
+    except KeyboardInterrupt as stop:
+        at = f" and saved at step {stop.args[0]}" if isinstance(stop, Interrupted) else ""
+        print(f"\nstopped{at}; go on with:", file=sys.stderr)
         print(f"python recipes/dl_rad.py resume={run.path}", file=sys.stderr)
         sys.exit(130)
     except ERRORS as error:

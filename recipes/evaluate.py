@@ -35,7 +35,9 @@ def main() -> None:
     try:
         policy = load_policy(arguments.folder)
         task = maze_task(read_json(f"{arguments.folder}/policy.json")["maze"])
-    except (CheckpointError, FileNotFoundError, KeyError) as error:
+        if arguments.episodes < 1:
+            raise ValueError(f"--episodes is {arguments.episodes}; at least one is needed.")
+    except (CheckpointError, FileNotFoundError, KeyError, ValueError) as error:
         sys.exit(f"error: {error.args[0] if isinstance(error, KeyError) else error}")
     env = make_maze_env(task, arguments.episodes)
     bf16 = uses_bf16(arguments.precision)

@@ -268,8 +268,11 @@ def evaluate_policies(
         episodes[name] = steps
         rows[name] = policy_row(task, parts.policy, steps)
         if name != BACKBONE:
+            torch.manual_seed(settings["seed"])  # the same pairs for each policy, and when resumed
             recorded = parts.policy[1].estimate == "recorded"
             rows[name]["step_error"] = None if recorded else step_error(parts.policy, windows)
+    if env is not None:
+        env.close()
     low, high = task.reference_scores
     about = {"task": cfg["env"]["name"], "seed": cfg["seed"], "data": cfg["replay_buffer"]}
     source = SCORE_SOURCE.format(low=low, high=high)
