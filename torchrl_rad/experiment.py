@@ -272,7 +272,9 @@ def evaluate_policies(
             recorded = parts.policy[1].estimate == "recorded"
             rows[name]["step_error"] = None if recorded else step_error(parts.policy, windows)
     if env is not None:
-        env.close()
+        threads = torch.get_num_threads()
+        env.close()  # TorchRL then raises the number of threads
+        torch.set_num_threads(threads)
     low, high = task.reference_scores
     about = {"task": cfg["env"]["name"], "seed": cfg["seed"], "data": cfg["replay_buffer"]}
     source = SCORE_SOURCE.format(low=low, high=high)
