@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import gc
 from itertools import cycle
 
 import pytest
@@ -72,7 +73,8 @@ def database(rows, dims):
     """One at a time: the next one is made when no test needs this one any more."""
     database = empty_database(rows)
     database.extend(recorded(rows, dims))
-    return database
+    yield database
+    gc.collect()  # a buffer and its storage refer to each other
 
 
 def driven(database: ExpertDatabase, queries: int) -> cycle:
@@ -144,6 +146,7 @@ def test_rad_database_extend_speed(benchmark, rows, dims):
     steps = recorded(rows, dims)
 
     def fresh():
+        gc.collect()  # that of the round before
         return (empty_database(rows), steps), {}
 
     benchmark.pedantic(lambda d, s: finished(d.extend(s)), setup=fresh, rounds=3)

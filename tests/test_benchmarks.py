@@ -19,6 +19,7 @@ def functions(tree):
     return {node.name: node for node in nodes if node.name.startswith("test_")}
 
 
+@pytest.mark.timeout(900)  # a second process that loads everything anew
 def test_each_benchmark_runs_at_its_smallest_size():
     command = [sys.executable, "-m", "pytest", "benchmarks", "--benchmark-disable", "-vv"]
     # -vv: pyproject.toml asks for -q, which takes one v away
