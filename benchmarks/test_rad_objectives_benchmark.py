@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import gc
 
 import pytest
 import torch
@@ -41,6 +42,8 @@ def fixed_threads():
 @pytest.fixture(autouse=True)
 def stated(benchmark):
     benchmark.extra_info.update(threads=THREADS, device=str(DEVICE), windows=BATCH, horizon=HORIZON)
+    yield
+    gc.collect()  # losses and optimisers refer to each other
 
 
 @pytest.fixture(scope="module")
