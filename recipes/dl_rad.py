@@ -40,7 +40,7 @@ from torchrl_rad.experiment import (
 )
 from torchrl_rad.plots import plot_curves, plot_targets
 from torchrl_rad.policy import save_policy
-from torchrl_rad.results import SCORE_SOURCE, format_table
+from torchrl_rad.results import format_table, score_source
 from torchrl_rad.runs import RunFolder
 from torchrl_rad.training import Interrupted, Objective, train, uses_bf16
 
@@ -65,8 +65,7 @@ def make_objectives(cfg: dict[str, Any], policies: dict[str, PolicyParts], train
         )
         names = ("lr", "warmup", "weight_decay", "ema")
         options = {name: optim[name] for name in names}
-        select = lambda windows: windows.select("observation")  # noqa: E731
-        return Objective(module, select, steps=steps, bf16=bf16, **options)
+        return Objective(module, lambda windows: windows, steps=steps, bf16=bf16, **options)
 
     objectives = {
         "planner": denoising(planner),
@@ -98,15 +97,12 @@ def run_training(run: RunFolder, cfg: dict[str, Any], policies, data, resume: bo
     objectives = make_objectives(cfg, policies, trained)
     logger, settings = make_logger(run, cfg), cfg["logger"]
     planner = policies[trained].policy[-1]
-    checkpointer = Checkpointer(run.path / "checkpoints")
-    latest = checkpointer.latest() if resume else None
-    run.metrics.rewind(0 if latest is None else int(latest.name.split("-")[1]))
     torch.manual_seed(cfg["seed"])
     train(
         objectives,
         window_sampler(data, cfg["network"]["horizon"], cfg["replay_buffer"]["batch_size"]),
         cfg["optim"]["gradient_steps"],
-        checkpointer,
+        Checkpointer(run.path / "checkpoints"),
         save_interval=settings["save_interval"],
         log_interval=settings["log_interval"],
         log=logger,
@@ -116,6 +112,7 @@ def run_training(run: RunFolder, cfg: dict[str, Any], policies, data, resume: bo
             "network": cfg["network"],
         },
         resume=resume,
+        begun=run.metrics.rewind,
         progress=settings["progress"],
     )
     for name in ("planner", BACKBONE):
@@ -158,8 +155,7 @@ def main_run(run: RunFolder, cfg: dict[str, Any], resume: bool) -> None:
     titles = {name: f"{name}: {rows[name]['score']:.0f}" for name in rows}
     plain = {name: parts.policy for name, parts in policies.items()}
     plot_targets(task, episodes, plain, titles, run.path / "targets.png")
-    low, high = task.reference_scores
-    print(f"\n{format_table(rows)}\n\n{SCORE_SOURCE.format(low=low, high=high)}", flush=True)
+    print(f"\n{format_table(rows)}\n\n{score_source(task)}", flush=True)
 
 
 @hydra.main(config_path="config", config_name="dl_rad", version_base="1.3")

@@ -16,7 +16,7 @@ from torchrl_rad import make_maze_env, maze_task
 from torchrl_rad.checkpoint import CheckpointError, read_json
 from torchrl_rad.experiment import collect_episodes, policy_row
 from torchrl_rad.policy import load_policy
-from torchrl_rad.results import SCORE_SOURCE, format_table
+from torchrl_rad.results import format_table, score_source
 from torchrl_rad.training import uses_bf16
 
 torchrl_logger.setLevel(logging.WARNING)
@@ -42,9 +42,8 @@ def main() -> None:
     env = make_maze_env(task, arguments.episodes)
     bf16 = uses_bf16(arguments.precision)
     steps = collect_episodes(env, policy, task.max_steps, arguments.seed, task.name, bf16)
-    low, high = task.reference_scores
     print(format_table({task.name: policy_row(task, policy, steps)}))
-    print(f"\n{SCORE_SOURCE.format(low=low, high=high)}")
+    print(f"\n{score_source(task)}")
 
 
 if __name__ == "__main__":

@@ -26,7 +26,7 @@ from torchrl_rad.envs.maze import FixedGoalMaze, MazeTask, make_maze_env, maze_t
 from torchrl_rad.evaluation import episode_results, evaluate, measure_latency, summarise
 from torchrl_rad.objectives.step import draw_step_pairs
 from torchrl_rad.policy import build_policy, fit_scales
-from torchrl_rad.results import SCORE_SOURCE
+from torchrl_rad.results import score_source
 from torchrl_rad.retrieval import RetrievalSampler
 from torchrl_rad.runs import RunFolder, environment_facts
 from torchrl_rad.training import uses_bf16
@@ -197,8 +197,7 @@ def collect_episodes(
 
     def act(tensordict: TensorDictBase) -> TensorDictBase:
         with torch.autocast(device.type, torch.bfloat16, bf16):
-            acted = policy(tensordict.to(device))
-        return acted.set("action", acted["action"].float()).to("cpu")  # where the mazes are
+            return policy(tensordict.to(device)).to("cpu")  # where the mazes are
 
     env.set_seed(seed)
     torch.manual_seed(seed)
@@ -275,9 +274,8 @@ def evaluate_policies(
         threads = torch.get_num_threads()
         env.close()  # TorchRL then raises the number of threads
         torch.set_num_threads(threads)
-    low, high = task.reference_scores
     about = {"task": cfg["env"]["name"], "seed": cfg["seed"], "data": cfg["replay_buffer"]}
-    source = SCORE_SOURCE.format(low=low, high=high)
+    source = score_source(task)
     facts = environment_facts()
     write_json(run.path / "results.json", {**about, "rows": rows, "score_source": source, **facts})
     return rows, episodes

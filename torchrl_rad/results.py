@@ -7,12 +7,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy import stats
 
 from torchrl_rad._files import CheckpointError, read_json
+from torchrl_rad.envs.maze import MazeTask
 from torchrl_rad.evaluation import interval
 
-__all__ = ["SCORE_SOURCE", "format_table", "merge_results"]
+__all__ = ["SCORE_SOURCE", "format_table", "merge_results", "score_source"]
 
 SCORE_SOURCE = (
     "score: 100 x (return - min) / (max - min), reference returns {low} and {high} of D4RL's "
@@ -34,6 +34,12 @@ COLUMNS = {  # key: (heading, format)
     "PL": ("PL ms", "{}"),
     "seeds": ("score of each seed", "{}"),
 }
+
+
+def score_source(task: MazeTask) -> str:
+    """The line under a table: how the scores of a task are normalised, and by whose returns."""
+    low, high = task.reference_scores
+    return SCORE_SOURCE.format(low=low, high=high)
 
 
 def format_table(rows: Mapping[str, Mapping[str, Any]]) -> str:
@@ -109,7 +115,7 @@ def _merge(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         for key in ("return", "success", "arrival", "share", "found", "similarity", "step_error")
         if all(row.get(key) is not None for row in rows)
     }
-    between = stats.sem(scores) * stats.t.ppf(0.975, len(scores) - 1) if len(scores) > 1 else 0.0
+    between = interval(scores)[1] if len(scores) > 1 else 0.0
     return {
         **merged,
         "score": float(np.mean(scores)),

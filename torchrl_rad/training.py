@@ -184,6 +184,7 @@ def train(
     log: Callable[[int, dict[str, float]], None],
     meta: Mapping[str, Any],
     resume: bool = False,
+    begun: Callable[[int], None] | None = None,
     progress: bool = True,
 ) -> int:
     """Trains all objectives on the same windows, saving at intervals, on Ctrl-C and on SIGTERM.
@@ -201,6 +202,7 @@ def train(
         log (callable): gets the step and the means.
         meta (mapping): what the run is, checked when it is resumed.
         resume (bool, optional): go on from the newest checkpoint. Defaults to ``False``.
+        begun (callable, optional): gets the step at which it begins, before the first is done.
         progress (bool, optional): show a bar with losses and time left. Defaults to ``True``.
 
     Returns:
@@ -219,9 +221,10 @@ def train(
     parts: dict[str, Any] = {"meter": meter, "rng": GlobalRNGState()}
     for name, objective in objectives.items():
         parts.update(objective.components(name))
-    begin = 0
-    if resume and checkpointer.latest() is not None:
-        begin = checkpointer.load(None, parts, meta)["step"]
+    latest = checkpointer.latest() if resume else None
+    begin = 0 if latest is None else checkpointer.load(latest, parts, meta)["step"]
+    if begun is not None:
+        begun(begin)
     bar = tqdm(total=steps, initial=begin, desc="training", unit="step", disable=not progress)
     with bar, _stop_requests() as stop:
         for step in range(begin + 1, steps + 1):

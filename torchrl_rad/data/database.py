@@ -25,7 +25,7 @@ from torchrl_rad.data.episodes import (
     return_to_go,
     step_and_remaining,
 )
-from torchrl_rad.data.experts import Expert
+from torchrl_rad.data.experts import Expert, select_episodes
 from torchrl_rad.data.saved import FORMAT, build, read_config, replaceable, require_space
 from torchrl_rad.retrieval.sampler import RetrievalSampler, storage_revision
 from torchrl_rad.retrieval.windows import WindowMax
@@ -178,11 +178,7 @@ class ExpertDatabase(TensorDictReplayBuffer):
     def _experts(self, steps: TensorDictBase, lengths: Tensor) -> TensorDictBase:
         if self.expert is None:
             return steps
-        episodes = list(steps.split(lengths.tolist()))
-        if isinstance(self.expert, Expert):
-            keep = self.expert.select(episodes)
-        else:
-            keep = torch.tensor([bool(self.expert(episode)) for episode in episodes])
+        keep = select_episodes(self.expert, steps.split(lengths.tolist()))
         if not keep.any():
             raise ValueError(
                 f"none of the {len(lengths)} episodes is an expert's by the rule {self.expert}; "

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
@@ -15,6 +15,7 @@ __all__ = [
     "expert_from_config",
     "first_hit_within",
     "reaches_goal",
+    "select_episodes",
     "subtasks_done",
     "top_share_by_return",
 ]
@@ -153,6 +154,25 @@ def top_share_by_return(share: float) -> Expert:
         ValueError: ``share`` lies outside (0, 1].
     """
     return _TopShare(share)
+
+
+def select_episodes(
+    rule: Callable[[TensorDictBase], bool], episodes: Sequence[TensorDictBase]
+) -> Tensor:
+    """Answers for each episode, bool [E]; a rule with ``select`` is asked for all at once.
+
+    Args:
+        rule (callable): an :class:`Expert`, or any function of one episode.
+        episodes (sequence of TensorDictBase): each [L].
+
+    Examples:
+        >>> from tensordict import TensorDict
+        >>> select_episodes(lambda episode: len(episode) > 1, [TensorDict({}, [n]) for n in (1, 2)])
+        tensor([False,  True])
+    """
+    if hasattr(rule, "select"):
+        return rule.select(list(episodes))
+    return torch.tensor([bool(rule(episode)) for episode in episodes], dtype=torch.bool)
 
 
 RULES: dict[str, Callable[..., Expert]] = {

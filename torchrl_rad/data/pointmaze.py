@@ -26,7 +26,7 @@ from torchrl_rad._files import (
     write_atomic,
     write_json,
 )
-from torchrl_rad.envs.maze import FixedGoalMaze, MazeTask, maze_task
+from torchrl_rad.envs.maze import GOAL_RADIUS, FixedGoalMaze, MazeTask, maze_task
 
 __all__ = ["cache_dir", "collect_pointmaze", "next_cells", "pointmaze_dataset"]
 
@@ -202,7 +202,7 @@ def _flat(states: np.ndarray, actions: np.ndarray, goal: np.ndarray) -> TensorDi
     rows = episodes * steps
     truncated = torch.zeros(episodes, steps, 1, dtype=torch.bool)
     truncated[:, -1] = True
-    reward = (np.linalg.norm(states[:, 1:, :2] - goal, axis=-1) <= 0.5).astype(np.float32)
+    reward = (np.linalg.norm(states[:, 1:, :2] - goal, axis=-1) <= GOAL_RADIUS).astype(np.float32)
     following = {
         "observation": torch.from_numpy(states[:, 1:].reshape(rows, 4)),
         "reward": torch.from_numpy(reward.reshape(rows, 1)),

@@ -11,6 +11,8 @@ from scipy.spatial import cKDTree
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from torchrl_rad.data.experts import select_episodes
+
 __all__ = ["DataReport", "describe_rows", "report"]
 
 SCHEMA = {  # entry: (dtype, shape)
@@ -363,10 +365,7 @@ def _examine_experts(td: TensorDictBase, lengths: Tensor, expert, found: DataRep
     if expert is None:
         return
     episodes = td.split(lengths.tolist())
-    if hasattr(expert, "select"):  # a rule that compares episodes with each other
-        kept = int(expert.select(list(episodes)).sum())
-    else:
-        kept = sum(bool(expert(episode)) for episode in episodes)
+    kept = int(select_episodes(expert, episodes).sum())
     found.expert_share = kept / len(episodes)
     if kept == 0:
         name = getattr(expert, "__name__", expert)

@@ -168,7 +168,7 @@ class DiffuserLitePlanner(TensorDictModuleBase):
         state = torch.nan_to_num(observation, nan=0.0, posinf=0.0, neginf=0.0).reshape(-1, width)
         pins = self._pins(tensordict, len(state)) if self.targets else [None] * len(self.levels)
         plan = self.plan(state, pins)
-        action = self.inverse_dynamics(state, plan[:, 1])
+        action = self.inverse_dynamics(state, plan[:, 1]).float()  # also under autocast
         tensordict.set(self.out_keys[0], plan.reshape(*shape, *plan.shape[1:]))
         tensordict.set(self.out_keys[1], action.reshape(*shape, action.shape[-1]))
         return tensordict

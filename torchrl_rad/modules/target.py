@@ -160,7 +160,7 @@ class RetrievalTargetModule(TensorDictModuleBase):
             )
         shape = state.shape[:-1]
         query = state.reshape(shape.numel(), state.shape[-1])
-        with self.database._replay_lock:  # rows chosen and rows read are of the same content
+        with self.database.lock:  # rows chosen and rows read are of the same content
             found = (
                 self._kept(tensordict, query) if self.retrieval_interval > 1 else self.select(query)
             )
@@ -206,7 +206,7 @@ class RetrievalTargetModule(TensorDictModuleBase):
             parts = [self.select(part) for part in query.split(QUERIES)]
             return tuple(torch.cat(column) for column in zip(*parts, strict=True))  # type: ignore
         database, device = self.database, query.device
-        with database._replay_lock:
+        with database.lock:
             rows, near = database.sampler.nearest(database.storage, query)  # [Q, k]
             if rows.numel() == 0:
                 none = torch.full((len(query),), -1, device=device)

@@ -2,13 +2,47 @@
 
 from __future__ import annotations
 
+from dataclasses import fields
 from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
+from tensordict.utils import NestedKey
 from torch import Tensor
+from torchrl.objectives.common import LossModule
 
-__all__ = ["window_masks"]
+__all__ = ["KeyedLoss", "window_masks"]
+
+
+class KeyedLoss(LossModule):
+    """A loss that reads its accepted keys, all of them and in the order in which they are declared.
+
+    Examples:
+        >>> from torchrl_rad import Normalizer, StepEstimationLoss, StepEstimator
+        >>> loss = StepEstimationLoss(StepEstimator(Normalizer.identity(2), horizon=9))
+        >>> loss.set_keys(target=("next", "target"))
+        >>> loss.in_keys
+        ['observation', ('next', 'target'), 'target_step']
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._in_keys: list[NestedKey] | None = None
+
+    @property
+    def in_keys(self) -> list[NestedKey]:
+        if self._in_keys is None:
+            keys: Any = self.tensor_keys
+            self._in_keys = [getattr(keys, field.name) for field in fields(keys)]
+        return self._in_keys
+
+    @in_keys.setter
+    def in_keys(self, value: list[NestedKey]) -> None:
+        self._in_keys = value
+
+    def set_keys(self, **kwargs: NestedKey) -> None:
+        super().set_keys(**kwargs)
+        self._in_keys = None  # else they would be the old ones
 
 
 def window_masks(

@@ -10,15 +10,14 @@ from tensordict import TensorDict, TensorDictBase, TensorDictParams
 from tensordict.nn import dispatch
 from tensordict.utils import NestedKey
 from torch import Tensor
-from torchrl.objectives.common import LossModule
 
 from torchrl_rad.modules.diffuser_lite import DiffuserLitePlanner, PlanNetworks
-from torchrl_rad.objectives.common import window_masks
+from torchrl_rad.objectives.common import KeyedLoss, window_masks
 
 __all__ = ["DenoisingLoss"]
 
 
-class DenoisingLoss(LossModule):
+class DenoisingLoss(KeyedLoss):
     r"""Generation loss with pseudo targets, for every level of a planner.
 
     It is L_d of RAD, equation "loss:difusion".
@@ -90,7 +89,6 @@ class DenoisingLoss(LossModule):
         super().__init__()
         if not 0.0 <= no_target <= 1.0:
             raise ValueError(f"no_target is {no_target}; expected a share in [0, 1].")
-        self._in_keys: list[NestedKey] | None = None
         self.convert_to_functional(planner.networks, "network", create_target_params=delay)
         self.planner_normalizer = planner.normalizer
         self.levels, self.horizon = planner.levels, planner.horizon
@@ -107,20 +105,6 @@ class DenoisingLoss(LossModule):
     @out_keys.setter
     def out_keys(self, value: list[str]) -> None:
         self._out_keys = value
-
-    @property
-    def in_keys(self) -> list[NestedKey]:
-        if self._in_keys is None:
-            self._in_keys = [self.tensor_keys.observation]
-        return self._in_keys
-
-    @in_keys.setter
-    def in_keys(self, value: list[NestedKey]) -> None:
-        self._in_keys = value
-
-    def set_keys(self, **kwargs: NestedKey) -> None:
-        super().set_keys(**kwargs)
-        self._in_keys = None
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:

@@ -10,10 +10,9 @@ from tensordict import TensorDict, TensorDictBase, TensorDictParams
 from tensordict.nn import dispatch
 from tensordict.utils import NestedKey
 from torch import Tensor
-from torchrl.objectives.common import LossModule
 
 from torchrl_rad.modules.return_model import ReturnModel
-from torchrl_rad.objectives.common import window_masks
+from torchrl_rad.objectives.common import KeyedLoss, window_masks
 
 __all__ = ["ReturnGuidanceLoss", "plan_return"]
 
@@ -40,7 +39,7 @@ def plan_return(reward: Tensor, value: Tensor, gamma: float) -> Tensor:
     return (reward[..., :-1] * discount[:-1]).sum(-1) + discount[-1] * value
 
 
-class ReturnGuidanceLoss(LossModule):
+class ReturnGuidanceLoss(KeyedLoss):
     r"""Mean squared error of the return model (L_g of RAD, equation "loss:g").
 
     .. math:: L_g = E (J_\phi(\tau) - C(\tau))^2
@@ -101,25 +100,9 @@ class ReturnGuidanceLoss(LossModule):
         super().__init__()
         if jump < 1:
             raise ValueError(f"jump is {jump}; expected 1 or more.")
-        self._in_keys: list[NestedKey] | None = None
         self.convert_to_functional(return_model, "return_model")
         self.jump, self.gamma = jump, gamma
         self.reduction = "mean" if reduction is None else reduction
-
-    @property
-    def in_keys(self) -> list[NestedKey]:
-        if self._in_keys is None:
-            keys = self.tensor_keys
-            self._in_keys = [keys.observation, keys.reward, keys.value]
-        return self._in_keys
-
-    @in_keys.setter
-    def in_keys(self, value: list[NestedKey]) -> None:
-        self._in_keys = value
-
-    def set_keys(self, **kwargs: NestedKey) -> None:
-        super().set_keys(**kwargs)
-        self._in_keys = None
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:

@@ -11,10 +11,9 @@ from tensordict import TensorDict, TensorDictBase, TensorDictParams
 from tensordict.nn import dispatch
 from tensordict.utils import NestedKey
 from torch import Tensor
-from torchrl.objectives.common import LossModule
 
 from torchrl_rad.modules.step import StepEstimator
-from torchrl_rad.objectives.common import window_masks
+from torchrl_rad.objectives.common import KeyedLoss, window_masks
 
 __all__ = ["StepEstimationLoss", "draw_step_pairs"]
 
@@ -47,7 +46,7 @@ def draw_step_pairs(windows: Tensor, generator: torch.Generator | None = None) -
     return TensorDict(pairs, [count])
 
 
-class StepEstimationLoss(LossModule):
+class StepEstimationLoss(KeyedLoss):
     r"""Cross entropy of the step estimator (L_e of RAD, equation "loss:e").
 
     .. math:: L_e = -E \log e[i]
@@ -99,24 +98,8 @@ class StepEstimationLoss(LossModule):
         self, estimator: StepEstimator, *, reduction: Literal["none", "mean", "sum"] | None = None
     ):
         super().__init__()
-        self._in_keys: list[NestedKey] | None = None
         self.convert_to_functional(estimator, "estimator")
         self.reduction = "mean" if reduction is None else reduction
-
-    @property
-    def in_keys(self) -> list[NestedKey]:
-        if self._in_keys is None:
-            keys = self.tensor_keys
-            self._in_keys = [keys.observation, keys.target, keys.target_step]
-        return self._in_keys
-
-    @in_keys.setter
-    def in_keys(self, value: list[NestedKey]) -> None:
-        self._in_keys = value
-
-    def set_keys(self, **kwargs: NestedKey) -> None:
-        super().set_keys(**kwargs)
-        self._in_keys = None
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
