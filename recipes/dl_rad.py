@@ -72,7 +72,9 @@ def make_objectives(cfg: dict[str, Any], policies: dict[str, PolicyParts], train
         BACKBONE: denoising(backbone),
         "estimator": Objective(
             StepEstimationLoss(estimator),
-            lambda windows: draw_step_pairs(windows["observation"]),
+            lambda windows: draw_step_pairs(
+                windows["observation"], horizon=estimator.horizon, pairs=loss["step_pairs"]
+            ),
             steps=steps,
             **head,
         ),
@@ -138,9 +140,7 @@ def main_run(run: RunFolder, cfg: dict[str, Any], resume: bool) -> None:
     print(f"run folder: {run.path}", flush=True)
     task, data = make_data(cfg)
     print(check_data(task, data), flush=True)
-    network = dict(cfg["network"])
-    step_width = network.pop("step_width")
-    policies = make_policies(network, cfg["retrieval"], data, step_width)
+    policies = make_policies(cfg["network"], cfg["retrieval"], data)
     for parts in policies.values():
         parts.policy.to(cfg["device"])
     for name, parts in policies.items():

@@ -31,6 +31,7 @@ PLANNER = {
     "horizon": 9, "jumps": [4, 1], "width": 16, "heads": 2, "blocks": 1, "steps": 1,
     "candidates": 2,
 }  # fmt: skip
+NETWORK = {**PLANNER, "step_horizon": 6, "step_width": 8}
 SAMPLER = {"metric": "euclidean", "dims": [0, 1], "k": 50, "threshold": 0.8}
 RETRIEVAL = {
     "paper": {
@@ -56,7 +57,7 @@ CONFIG = {
         "dataset": "collected", "steps": 3000, "seed": 0, "download": False, "batch_size": 8
     },
     "optim": {"precision": "fp32"},
-    "network": PLANNER,
+    "network": NETWORK,
     "loss": {"gamma": 0.9},
     "logger": {"backend": "csv", "mode": "offline", "project_name": "tests", "progress": False},
     "evaluation": {"episodes": 2, "seed": 10_000},
@@ -75,7 +76,7 @@ def data(tmp_path_factory):
 @pytest.fixture
 def policies(data):
     torch.manual_seed(0)
-    return make_policies(PLANNER, RETRIEVAL, data, step_width=8)
+    return make_policies(NETWORK, RETRIEVAL, data)
 
 
 def logging_to(**changes):
@@ -182,9 +183,9 @@ def test_step_error_by_hand(policies, monkeypatch):
         "target": torch.zeros(3, 4),
         "target_step": torch.tensor([[1], [4], [8]]),
     }
-    monkeypatch.setattr("torchrl_rad.experiment.draw_step_pairs", lambda *_: pairs)
-    logits = torch.full((3, 8), -9.0)
-    logits[0, 0] = logits[1, 5] = logits[2, 4] = 9.0  # steps 1, 6 and 5: errors 0, 2 and 3
+    monkeypatch.setattr("torchrl_rad.experiment.draw_step_pairs", lambda *_, **__: pairs)
+    logits = torch.full((3, 5), -9.0)
+    logits[0, 0] = logits[1, 1] = logits[2, 4] = 9.0  # steps 1, 2 and 5: errors 0, 2 and 3
     monkeypatch.setattr(type(policy[1]), "logits", lambda *_: logits)
     assert step_error(policy, {"observation": None}) == pytest.approx(5 / 3)
 

@@ -143,12 +143,25 @@ def test_the_description_is_left_alone(database):
     assert ABOUT == before
 
 
-@pytest.mark.parametrize("part", ["target", "estimator"])
-def test_other_horizon(database, part):
-    about = {**ABOUT, part: {**ABOUT[part], "horizon": 17}}
+def test_targets_nearer_than_the_planner_looks(database):
+    about = {**ABOUT, "target": {**ABOUT["target"], "horizon": 6}}
+    select, estimator, planner = build_policy(about, database)
+    assert (select.horizon, estimator.horizon, planner.horizon) == (6, 6, 9)
+
+
+@pytest.mark.parametrize(
+    ("part", "horizon", "message"),
+    [
+        ("target", 17, "the horizon of 'target' is 17, but the planner was built for 9"),
+        ("estimator", 17, "the horizon of 'estimator' is 17, but that of 'target' is 9"),
+        ("estimator", 5, "the horizon of 'estimator' is 5, but that of 'target' is 9"),
+    ],
+)
+def test_other_horizon(database, part, horizon, message):
+    about = {**ABOUT, part: {**ABOUT[part], "horizon": horizon}}
     with pytest.raises(ValueError) as caught:
         build_policy(about, database)
-    assert f"the horizon of {part!r} is 17, but the planner was built for 9" in str(caught.value)
+    assert message in str(caught.value)
 
 
 def test_no_database():

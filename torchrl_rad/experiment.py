@@ -114,23 +114,36 @@ def make_database(data: TensorDictBase, options: Mapping[str, Any]) -> ExpertDat
 
 
 def make_policies(
-    planner: Mapping[str, Any], retrieval: Mapping[str, Any], data: TensorDictBase, step_width: int
+    network: Mapping[str, Any], retrieval: Mapping[str, Any], data: TensorDictBase
 ) -> dict[str, PolicyParts]:
     """The backbone and one policy for each way to retrieve, with fresh weights.
 
     Args:
-        planner (mapping): arguments of the planner.
+        network (mapping): arguments of the planner, and ``step_horizon`` (of target and step
+            estimator) and ``step_width`` (of the latter's network).
         retrieval (mapping): name -> ``expert``, ``gamma``, ``sampler``, ``target``, ``estimator``.
         data (TensorDictBase): flat steps [T].
-        step_width (int): width of the step estimator.
+
+    Raises:
+        ValueError: a policy asks for a horizon of its own; they share one step estimator.
     """
+    planner = dict(network)
+    reach, width = planner.pop("step_horizon"), planner.pop("step_width")
     sizes = {"state_dim": data["observation"].shape[-1], "action_dim": data["action"].shape[-1]}
-    shared = {**sizes, "planner": dict(planner)}
+    shared = {**sizes, "planner": planner}
     policies = {BACKBONE: PolicyParts(build_policy(shared), shared)}
     for name, options in retrieval.items():
+        for part in ("target", "estimator"):
+            other = options[part].get("horizon", reach)
+            if other != reach:
+                raise ValueError(
+                    f"the horizon of {part!r} is {other} for {name!r}, but step_horizon is {reach}; "
+                    "set network.step_horizon: all policies share one step estimator."
+                )
         database = make_database(data, options)
-        estimator = {"width": step_width, **options["estimator"]}
-        description = {**shared, "target": dict(options["target"]), "estimator": estimator}
+        target = {"horizon": reach, **options["target"]}
+        estimator = {"width": width, **options["estimator"]}
+        description = {**shared, "target": target, "estimator": estimator}
         policy = build_policy(description, database)
         policies[name] = PolicyParts(policy, description, database)
     for parts in policies.values():
@@ -164,7 +177,7 @@ def window_sampler(data: TensorDictBase, horizon: int, batch_size: int):
 def step_error(policy: TensorDictSequential, windows: TensorDictBase) -> float:
     """Mean absolute error of the step estimator on pairs of recorded states, in steps."""
     estimator = policy[1]
-    pairs = draw_step_pairs(windows["observation"])
+    pairs = draw_step_pairs(windows["observation"], horizon=estimator.horizon)
     with torch.no_grad():
         steps = estimator._steps(estimator.logits(pairs["observation"], pairs["target"]))
     return float((steps - pairs["target_step"]).abs().float().mean())

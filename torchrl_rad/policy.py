@@ -41,11 +41,13 @@ def build_policy(
     Args:
         description (dict): ``state_dim``, ``action_dim``; ``planner``, ``estimator`` and
             ``target``: arguments of :class:`DiffuserLitePlanner`, :class:`StepEstimator` and
-            :class:`RetrievalTargetModule`. One horizon, the planner's, holds for all three.
+            :class:`RetrievalTargetModule`. The horizon of ``"target"`` holds for the estimator too;
+            it is the planner's if it is left out.
         database (ExpertDatabase, optional): the demonstrations, needed with a target.
 
     Raises:
-        ValueError: a target is described and there is no database, or its horizon is another one.
+        ValueError: a target is described and there is no database, or its horizon is larger than
+            the planner's or not the estimator's.
 
     Examples:
         >>> policy = build_policy({
@@ -57,13 +59,18 @@ def build_policy(
     planner_options = {**PLANNER, **description["planner"]}
     estimator_options = dict(description.get("estimator") or {})
     horizon = planner_options["horizon"]
-    for name, options in (("target", target), ("estimator", estimator_options)):
-        other = (options or {}).get("horizon", horizon)
-        if other != horizon:
-            raise ValueError(
-                f"the horizon of {name!r} is {other}, but the planner was built for {horizon}; "
-                "leave it out, so that the planner's holds."
-            )
+    reach = (target or {}).get("horizon", horizon)
+    if reach > horizon:
+        raise ValueError(
+            f"the horizon of 'target' is {reach}, but the planner was built for {horizon}; "
+            f"a target beyond the plan cannot be planned for: use {horizon} or less."
+        )
+    other = estimator_options.get("horizon", reach)
+    if other != reach:
+        raise ValueError(
+            f"the horizon of 'estimator' is {other}, but that of 'target' is {reach}; "
+            "leave it out, so that the target's holds."
+        )
     states, difference = Normalizer.identity(width), Normalizer.identity(width)
     inverse = InverseDynamics(states, difference, description["action_dim"])
     if planner_options["candidates"] > 1:
@@ -79,7 +86,7 @@ def build_policy(
     select = RetrievalTargetModule(
         database, out_keys=[*OUT_KEYS, "target_offset"], **{"horizon": horizon, **target}
     )
-    estimator = StepEstimator(states, **{"horizon": horizon, **estimator_options})
+    estimator = StepEstimator(states, **{"horizon": reach, **estimator_options})
     return TensorDictSequential(select, estimator, planner)
 
 

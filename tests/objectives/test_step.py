@@ -38,14 +38,19 @@ def logits(loss, td):
 
 
 @settings(max_examples=30, deadline=None)
-@given(count=st.integers(1, 50), horizon=st.integers(2, 40), seed=st.integers(0, 1000))
-def test_pairs_lie_inside_one_window(count, horizon, seed):
+@given(
+    count=st.integers(1, 50), horizon=st.integers(2, 40), more=st.integers(0, 9),
+    pairs=st.integers(1, 4), seed=st.integers(0, 1000),
+)  # fmt: skip
+def test_pairs_lie_inside_one_window(count, horizon, more, pairs, seed):
     rows = 1000.0 * torch.arange(count)[:, None]
-    windows = (rows + torch.arange(horizon))[..., None]
-    drawn = draw_step_pairs(windows, torch.Generator().manual_seed(seed))
-    assert drawn.batch_size == (count,) and drawn["target_step"].dtype == torch.int64
+    windows = (rows + torch.arange(horizon + more))[..., None]
+    generator = torch.Generator().manual_seed(seed)
+    drawn = draw_step_pairs(windows, generator, horizon=horizon, pairs=pairs)
+    assert drawn.batch_size == (count * pairs,) and drawn["target_step"].dtype == torch.int64
+    rows = rows.repeat_interleave(pairs, 0)
     begin, end = drawn["observation"] - rows, drawn["target"] - rows
-    assert ((begin >= 0) & (end <= horizon - 1)).all()
+    assert ((begin >= 0) & (end <= horizon + more - 1)).all()
     assert torch.equal(end - begin, drawn["target_step"].float())
     assert ((drawn["target_step"] >= 1) & (drawn["target_step"] <= horizon - 1)).all()
 
@@ -60,6 +65,11 @@ def test_steps_and_starts_are_uniform():
         share = torch.bincount(begin[step == i], minlength=room) / int((step == i).sum())
         assert len(share) == room
         torch.testing.assert_close(share, torch.full((room,), 1 / room), atol=0.03, rtol=0)
+
+
+def test_windows_shorter_than_the_horizon():
+    with pytest.raises(ValueError, match="windows of 9 states hold no pairs up to 32 steps apart"):
+        draw_step_pairs(torch.zeros(2, 9, 3), horizon=33)
 
 
 def test_pairs_follow_the_generator():

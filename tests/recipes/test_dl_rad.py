@@ -333,7 +333,8 @@ def assert_error(ran, message):
         ("retrieval.paper.target.tolerance=-1", r"tolerance is -1; it must not be negative"),
         ("retrieval.paper.target.rule=lowest", r"rule is 'lowest'"),
         ("retrieval.followed.target.ahead=500", r"ahead is 500"),
-        ("+retrieval.paper.target.horizon=65", r"the horizon of 'target' is 65.*built for 129"),
+        ("network.step_horizon=130", r"the horizon of 'target' is 130.*built for 129"),
+        ("+retrieval.paper.target.horizon=65", r"the horizon of 'target' is 65.*step_horizon"),
         ("+retrieval.paper.estimator.horizon=65", r"the horizon of 'estimator' is 65"),
         ("retrieval.paper.gamma=1.5", r"gamma is 1.5"),
         (

@@ -18,17 +18,31 @@ from torchrl_rad.objectives.common import KeyedLoss, window_masks
 __all__ = ["StepEstimationLoss", "draw_step_pairs"]
 
 
-def draw_step_pairs(windows: Tensor, generator: torch.Generator | None = None) -> TensorDict:
-    """Pairs (s_t, s_{t+i}), one from each window: i uniform in 1..H-1, t in what room is left.
+def draw_step_pairs(
+    windows: Tensor,
+    generator: torch.Generator | None = None,
+    *,
+    horizon: int | None = None,
+    pairs: int = 1,
+) -> TensorDict:
+    """Pairs (s_t, s_{t+i}) from windows: i uniform in 1..H-1, t in what room is left.
 
     A window lies inside one episode, and so does a pair.
 
     Args:
-        windows (Tensor): [B, H, S].
+        windows (Tensor): [B, W, S].
         generator (torch.Generator, optional): source of randomness.
 
+    Keyword Args:
+        horizon (int, optional): H of the step estimator. Defaults to W.
+        pairs (int, optional): from each window. Defaults to ``1``.
+
     Returns:
-        TensorDict [B] with ``observation``, ``target`` [B, S] and ``target_step`` [B, 1] int64.
+        TensorDict [B * pairs] with ``observation``, ``target`` [B * pairs, S] and ``target_step``
+        [B * pairs, 1] int64.
+
+    Raises:
+        ValueError: the windows are shorter than ``horizon``.
 
     Examples:
         >>> windows = torch.arange(9.0)[None, :, None].expand(4, 9, 1)
@@ -36,14 +50,21 @@ def draw_step_pairs(windows: Tensor, generator: torch.Generator | None = None) -
         >>> bool((pairs["target"] - pairs["observation"] == pairs["target_step"]).all())
         True
     """
-    count, horizon, _ = windows.shape
-    rows = torch.arange(count, device=windows.device)
-    step = torch.randint(1, horizon, (count,), generator=generator, device=windows.device)
-    room = (horizon - step).float()
-    begin = (torch.rand(count, generator=generator, device=windows.device) * room).long()
+    length, device = windows.shape[1], windows.device
+    if horizon is None:
+        horizon = length
+    if length < horizon:
+        raise ValueError(
+            f"windows of {length} states hold no pairs up to {horizon - 1} steps apart; draw "
+            f"windows of {horizon} states or more."
+        )
+    rows = torch.arange(len(windows), device=device).repeat_interleave(pairs)
+    step = torch.randint(1, horizon, rows.shape, generator=generator, device=device)
+    room = (length - step).float()
+    begin = (torch.rand(rows.shape, generator=generator, device=device) * room).long()
     state, target = windows[rows, begin], windows[rows, begin + step]
-    pairs = {"observation": state, "target": target, "target_step": step[:, None]}
-    return TensorDict(pairs, [count])
+    drawn = {"observation": state, "target": target, "target_step": step[:, None]}
+    return TensorDict(drawn, rows.shape)
 
 
 class StepEstimationLoss(KeyedLoss):
