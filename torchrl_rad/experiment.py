@@ -137,8 +137,8 @@ def make_policies(
             other = options[part].get("horizon", reach)
             if other != reach:
                 raise ValueError(
-                    f"the horizon of {part!r} is {other} for {name!r}, but step_horizon is {reach}; "
-                    "set network.step_horizon: all policies share one step estimator."
+                    f"the horizon of {part!r} is {other} for {name!r}, not the step_horizon "
+                    f"{reach}; set network.step_horizon: all policies share one step estimator."
                 )
         database = make_database(data, options)
         target = {"horizon": reach, **options["target"]}
