@@ -10,7 +10,13 @@ import pytest
 from scipy import stats
 
 from torchrl_rad.checkpoint import CheckpointError
-from torchrl_rad.results import COLUMNS, SCORE_SOURCE, format_table, merge_results
+from torchrl_rad.results import (
+    COLUMNS,
+    SCORE_SOURCE,
+    format_table,
+    merge_results,
+    write_results,
+)
 
 # the tables of Student's t distribution, 97.5 %
 T1, T3 = 12.7062047, 3.1824463
@@ -148,17 +154,18 @@ def test_merge_seeds_of_different_numbers_of_episodes(folder):
 def test_merge_leaves_out_what_a_run_lacks(folder):
     folders = [
         folder("0", {"backbone": row(1.0, [1.0, 1.0]), "paper": row(2.0, [2.0, 2.0], found=1.0)}),
-        folder("1", {"paper": row(2.0, [2.0, 2.0], found=None)}),
+        folder("1", {"paper": row(2.0, [2.0, 2.0])}),
     ]
     merged = merge_results(folders)
     assert list(merged) == ["paper"]
     assert "found" not in merged["paper"]
 
 
-def test_merge_means_over_the_seeds_that_arrived(folder):
+@pytest.mark.parametrize("nothing", [None, math.nan])
+def test_merge_means_over_the_seeds_that_arrived(folder, nothing):
     folders = [
         folder("0", {"a": row(1.0, [1.0, 1.0], arrival=60.0)}),
-        folder("1", {"a": row(2.0, [2.0, 2.0], arrival=math.nan)}),
+        folder("1", {"a": row(2.0, [2.0, 2.0], arrival=nothing)}),
     ]
     assert merge_results(folders)["a"]["arrival"] == 60.0
 
@@ -172,6 +179,15 @@ def test_merged_rows_make_a_table(folder):
     assert lines[0] == "| policy | return | score | +- 95 % | episodes | score of each seed |"
     assert lines[2] == "| backbone | 0.5 | 1.0 | 1.8 | 4 | 1.0, 1.0 |"
     assert lines[3] == "| paper | 7.5 | 15.0 | 63.5 | 4 | 10.0, 20.0 |"
+
+
+def test_results_hold_no_constant_that_json_lacks(tmp_path):
+    rows = {"a": {"arrival": math.nan, "share": [1.0, math.inf, (-math.inf,)], "episodes": 3}}
+    write_results(tmp_path, {"task": "nan", "rows": rows})
+    text = (tmp_path / "results.json").read_text()
+    read = json.loads(text, parse_constant=lambda name: pytest.fail(f"{name} is not JSON"))
+    assert read["rows"] == {"a": {"arrival": None, "share": [1.0, None, [None]], "episodes": 3}}
+    assert read["task"] == "nan"
 
 
 def test_no_results(folder, tmp_path):

@@ -15,7 +15,6 @@ from torchrl.envs import EnvBase
 from torchrl.record.loggers import get_logger
 from tqdm import tqdm
 
-from torchrl_rad._files import write_json
 from torchrl_rad.data.database import ExpertDatabase
 from torchrl_rad.data.episodes import episode_lengths, return_to_go
 from torchrl_rad.data.experts import expert_from_config
@@ -26,7 +25,7 @@ from torchrl_rad.envs.maze import FixedGoalMaze, MazeTask, make_maze_env, maze_t
 from torchrl_rad.evaluation import episode_results, evaluate, measure_latency, summarise
 from torchrl_rad.objectives.step import draw_step_pairs
 from torchrl_rad.policy import build_policy, fit_scales
-from torchrl_rad.results import score_source
+from torchrl_rad.results import score_source, write_results
 from torchrl_rad.retrieval import RetrievalSampler
 from torchrl_rad.runs import RunFolder, environment_facts
 from torchrl_rad.training import uses_bf16
@@ -290,7 +289,7 @@ def evaluate_policies(
     about = {"task": cfg["env"]["name"], "seed": cfg["seed"], "data": cfg["replay_buffer"]}
     source = score_source(task)
     facts = environment_facts()
-    write_json(run.path / "results.json", {**about, "rows": rows, "score_source": source, **facts})
+    write_results(run.path, {**about, "rows": rows, "score_source": source, **facts})
     return rows, episodes
 
 

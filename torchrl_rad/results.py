@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from torchrl_rad._files import CheckpointError, read_json
+from torchrl_rad._files import CheckpointError, read_json, write_json
 from torchrl_rad.envs.maze import MazeTask
 from torchrl_rad.evaluation import interval
 
-__all__ = ["SCORE_SOURCE", "format_table", "merge_results", "score_source"]
+__all__ = ["SCORE_SOURCE", "format_table", "merge_results", "score_source", "write_results"]
 
 SCORE_SOURCE = (
     "score: 100 x (return - min) / (max - min), reference returns {low} and {high} of D4RL's "
@@ -96,6 +96,27 @@ def merge_results(folders: Sequence[str | Path]) -> dict[str, dict[str, Any]]:
     return {name: _merge([run["rows"][name] for run in runs]) for name in names}
 
 
+def write_results(folder: str | Path, results: Mapping[str, Any]) -> None:
+    """Writes ``results.json`` into a run folder; NaN and Inf, which JSON does not know, are null.
+
+    Args:
+        folder (path): of the run.
+        results (mapping): ``task``, ``rows`` (name -> figures) and what else is known of the run.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
+    write_json(Path(folder) / "results.json", _finite(results))
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {key: _finite(entry) for key, entry in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_finite(entry) for entry in value]
+    return None if isinstance(value, float) and not np.isfinite(value) else value
+
+
 def _read(folder: Path) -> dict[str, Any]:
     if not (folder / "results.json").exists():
         raise CheckpointError(
@@ -111,9 +132,9 @@ def _merge(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     scores = [row["score"] for row in rows]
     pooled = np.concatenate([row["episode_scores"] for row in rows])
     merged = {
-        key: interval([row[key] for row in rows])[0]
+        key: interval([np.nan if row[key] is None else row[key] for row in rows])[0]
         for key in ("return", "success", "arrival", "share", "found", "similarity", "step_error")
-        if all(row.get(key) is not None for row in rows)
+        if all(key in row for row in rows)
     }
     between = interval(scores)[1] if len(scores) > 1 else 0.0
     return {

@@ -434,7 +434,6 @@ def test_emptied_and_filled_again():
     assert len(database) == 0
     database.extend(make_steps([[1, 1]], offset=1.0))
     assert database.retrieve(torch.tensor([2.0]))["index"].tolist() == [1, 0, -1]
-    assert database.window_max(2).values.tolist() == database[:]["return_to_go"].tolist()
 
 
 def test_later_rows_are_found():
@@ -468,25 +467,14 @@ def test_sample_unit_adds_windows():
     assert (windows["episode"] == windows["episode"][:, :1]).all()
 
 
-def test_window_max_follows_changes():
-    database = make_database([[0, 1, 5]], gamma=0.0)
-    assert database.window_max(3) is database.window_max(2)
-    low, high = torch.tensor([0]), torch.tensor([1])
-    assert database.window_max(3).max(low, high).tolist() == [1]
-    database.extend(make_steps([[7, 9]]))
-    assert database.window_max(3).max(low + 3, high + 3).tolist() == [9]
-
-
 @pytest.mark.parametrize("storage", STORAGES)
 def test_state_dict_brings_rows_and_drops_what_was_known_of_others(storage):
     database, other = make_database([[1, 1, 1]], storage), make_database([[0, 2, 0]], storage)
     other[:]["observation"].add_(10.0)
     assert database.retrieve(torch.tensor([10.0]))["index"].tolist() == [2, 1, 0]
-    database.window_max(2)
     database.load_state_dict(other.state_dict())
     assert database.digest() == other.digest()
     assert database.retrieve(torch.tensor([10.0]))["index"].tolist() == [0, 1, 2]
-    assert database.window_max(2).values.tolist() == other[:]["return_to_go"].tolist()
 
 
 # identity
@@ -593,7 +581,7 @@ def test_queries_see_whole_episodes(storage):
     assert len(database) == length * episodes
 
 
-@pytest.mark.parametrize("ask", ["retrieve", "digest", "window_max", "sample"])
+@pytest.mark.parametrize("ask", ["retrieve", "digest", "sample"])
 def test_nothing_is_read_between_a_new_length_and_its_rows(ask):
     answers = []
 
@@ -607,7 +595,7 @@ def test_nothing_is_read_between_a_new_length_and_its_rows(ask):
                 self.asker.join(0.5)
                 answers.append("too early" if not self.asker.is_alive() else "waits")
 
-    argument = {"retrieve": torch.zeros(1), "digest": None, "window_max": 5, "sample": 4}[ask]
+    argument = {"retrieve": torch.zeros(1), "digest": None, "sample": 4}[ask]
     sampler = RetrievalSampler("euclidean", k=3, threshold=0.0)
     database = ExpertDatabase(Slow(10), gamma=1.0, sampler=sampler)
     database.extend(make_steps([[1, 1]], offset=5.0))

@@ -28,7 +28,6 @@ from torchrl_rad.data.episodes import (
 from torchrl_rad.data.experts import Expert, select_episodes
 from torchrl_rad.data.saved import FORMAT, build, read_config, replaceable, require_space
 from torchrl_rad.retrieval.sampler import RetrievalSampler, storage_revision
-from torchrl_rad.retrieval.windows import WindowMax
 
 __all__ = ["ExpertDatabase"]
 
@@ -106,7 +105,6 @@ class ExpertDatabase(TensorDictReplayBuffer):
         self.gamma, self.expert = float(gamma), expert
         self.path: Path | None = None  # where this content is saved
         self._saved: tuple | None = None
-        self._window_max: tuple[tuple, WindowMax] | None = None
 
     # filling
 
@@ -238,16 +236,6 @@ class ExpertDatabase(TensorDictReplayBuffer):
         hits = hits.to(query.device).exclude("index")
         hits.update({"index": index, **info})
         return hits
-
-    def window_max(self, longest: int) -> WindowMax:
-        """Look-up of the best return within ``longest`` rows, made anew after a change."""
-        with self._replay_lock:
-            revision = storage_revision(self._storage)
-            made = self._window_max
-            if made is None or made[0] != revision or made[1].longest < min(longest, len(self)):
-                value = self._storage[:]["return_to_go"]
-                made = self._window_max = (revision, WindowMax(value, longest))
-            return made[1]
 
     def digest(self) -> str:
         """sha256 of the rows, discount, expert rule and search settings.
