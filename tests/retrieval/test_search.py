@@ -1,3 +1,5 @@
+from unittest import mock
+
 import numpy as np
 import pytest
 import torch
@@ -41,13 +43,15 @@ def test_equals_brute_force(backend, metric, values, data):
     rows = torch.tensor(data.draw(st.lists(state, min_size=1, max_size=25)))
     query = torch.tensor(data.draw(st.lists(state, min_size=1, max_size=4)))
     k = data.draw(st.integers(1, len(rows)))
-    assert_exact(build_index(rows, metric, backend), query, rows, metric, k)
+    with mock.patch.object(search, "SPARE", data.draw(st.sampled_from([0, 1, 32]))):
+        assert_exact(build_index(rows, metric, backend), query, rows, metric, k)
 
 
 @pytest.mark.parametrize("metric", ["euclidean", "cosine"])
 @pytest.mark.parametrize("entries", [1, 7, 20, 64])
 def test_chunk_borders(metric, entries, monkeypatch):
     monkeypatch.setattr(search, "SCAN_ENTRIES", entries)
+    monkeypatch.setattr(search, "SPARE", 1)
     rows = torch.randint(-2, 3, (33, 2), generator=torch.Generator().manual_seed(1)).float()
     query = torch.tensor([[0.5, 0.5], [1.0, 0.0], [-2.0, 2.0]])
     for k in (1, 2, 5, 33):
@@ -56,8 +60,55 @@ def test_chunk_borders(metric, entries, monkeypatch):
 
 def test_ties_across_chunks_keep_the_lower_rows(monkeypatch):
     monkeypatch.setattr(search, "SCAN_ENTRIES", 3)
+    monkeypatch.setattr(search, "SPARE", 1)
     rows = torch.ones(10, 1)
     assert ScanIndex(rows, "euclidean").search(torch.zeros(1, 1), 4)[1].tolist() == [[0, 1, 2, 3]]
+
+
+@pytest.mark.parametrize("metric", ["euclidean", "cosine"])
+@pytest.mark.parametrize("far", [0.0, 1e4], ids=["centred", "far from zero"])
+@pytest.mark.parametrize("precision", ["highest", "medium"])
+def test_scan_of_many_dims(metric, far, precision, monkeypatch):
+    # what float32 cannot tell apart: rows differ in digits that their products do not hold
+    monkeypatch.setattr(search, "SCAN_ENTRIES", 500)
+    generator = torch.Generator().manual_seed(0)
+    rows = far + torch.randn(300, 17, generator=generator)
+    rows = torch.cat([rows, rows + 1e-3 * torch.randn(300, 17, generator=generator)])
+    query = rows[:3] + 0.1
+    before = torch.get_float32_matmul_precision()
+    torch.set_float32_matmul_precision(precision)
+    try:
+        with torch.autocast("cpu", torch.bfloat16):
+            assert_exact(ScanIndex(rows, metric), query, rows, metric, 40)
+    finally:
+        torch.set_float32_matmul_precision(before)
+
+
+@pytest.mark.parametrize("metric", ["euclidean", "cosine"])
+@pytest.mark.parametrize("scale", [1e-25, 1e25])
+def test_scan_beyond_the_range_of_float32(metric, scale):
+    generator = torch.Generator().manual_seed(0)
+    rows = scale * torch.randn(200, 3, generator=generator)
+    rows[7] = 0.0
+    for query in (rows[:2] * 1.1, torch.zeros(1, 3), torch.full((1, 3), 1e30)):
+        assert_exact(ScanIndex(rows, metric), query, rows, metric, 5)
+        one = torch.randn(200, 3, generator=generator)
+        assert_exact(ScanIndex(one, metric), query, one, metric, 5)
+
+
+def test_scan_copies_no_rows():
+    rows = torch.randn(20, 3)
+    for metric in ("euclidean", "cosine"):
+        assert ScanIndex(rows, metric).factors.data_ptr() == rows.data_ptr()
+
+
+def test_scan_looks_at_few_rows_twice(monkeypatch):
+    # the proof holds for rows in general position: no second look
+    monkeypatch.setattr(ScanIndex, "_above", lambda *_: pytest.fail("a second look"))
+    generator = torch.Generator().manual_seed(0)
+    rows = torch.randn(5000, 29, generator=generator)
+    for metric in ("euclidean", "cosine"):
+        ScanIndex(rows, metric).search(rows[:8] + 0.01, 50)
 
 
 def test_tree_ties_at_the_last_place():

@@ -13,7 +13,9 @@ __all__ = ["Metric", "ScanIndex", "TreeIndex", "build_index", "similarity"]
 
 Metric = Literal["cosine", "euclidean"]
 
-SCAN_ENTRIES = 2**22  # entries of states that a search compares at a time
+SCAN_ENTRIES = 2**20  # scores that a search holds at a time
+SPARE = 32  # rows ranked beyond k, at least
+TINY, HUGE = 1e-15, 1e15  # sizes whose squares float32 holds
 TREE_DIMS = 3  # beyond, a scan of k in the hundreds is faster
 
 
@@ -74,7 +76,11 @@ def _order(similarity: Tensor, index: Tensor, k: int) -> tuple[Tensor, Tensor]:
 
 
 class ScanIndex:
-    """Compares a query with every row, a chunk at a time; never holds queries x rows.
+    """Compares a query with every row, in one matrix product a chunk; never holds queries x rows.
+
+    The product is taken in float32 and gives each row a score with a known largest error. The best
+    scores are ranked anew in float64; that no other row can be among the k follows from the error,
+    and where it does not, all rows that could be are ranked. So answers are exact.
 
     Args:
         rows (Tensor): [N, D].
@@ -88,6 +94,14 @@ class ScanIndex:
 
     def __init__(self, rows: Tensor, metric: Metric):
         self.rows, self.metric = rows, metric
+        parts = rows.split(max(1, SCAN_ENTRIES // rows.shape[-1]))
+        size = torch.cat([part.double().norm(dim=-1) for part in parts])
+        self.largest = float(size.max()) if len(rows) else 0.0
+        # beyond, squares leave the range of float32
+        narrow = bool(((size == 0) | ((size > TINY) & (size < HUGE))).all()) and self.largest > 0
+        self.factors = rows.float() if narrow else rows.double()  # no copy of float32 rows
+        self.offset = -size.square() / 2 if metric == "euclidean" else 1.0 / size
+        self.offset = self.offset.to(self.factors)
 
     def search(self, query: Tensor, k: int) -> tuple[Tensor, Tensor]:
         """The k most similar rows of each query.
@@ -100,31 +114,67 @@ class ScanIndex:
             Similarities, float64 [Q, k], falling, and row numbers, int64 [Q, k]; ties by the lower
             row.
         """
-        count = len(self.rows)
-        chunk = max(k, SCAN_ENTRIES // max(1, len(query) * self.rows.shape[-1]))
-        best = query.new_empty(len(query), 0, dtype=torch.float64)
-        index = torch.empty(len(query), 0, dtype=torch.int64, device=query.device)
-        for begin in range(0, count, chunk):
-            rows = self.rows[begin : begin + chunk]
-            near = similarity(query[:, None], rows, self.metric)  # [Q, chunk]
-            kept, place = _leading(near, min(k, near.shape[-1]))
-            best = torch.cat([best, kept], -1)
-            index = torch.cat([index, place + begin], -1)
-            best, index = _order(best, index, min(k, best.shape[-1]))
+        query = query.double()
+        kept = min(len(self.rows), k + max(SPARE, k // 4))
+        score, index = self._best(query, kept)
+        near, index = _order(similarity(query[:, None], self.rows[index], self.metric), index, k)
+        if kept < len(self.rows):
+            least = self._least_score(query, near[:, -1])
+            for row in (~(score[:, -1] < least)).nonzero().flatten().tolist():  # ties, mostly
+                one = query[row : row + 1]
+                index[row], near[row] = self._above(one, float(least[row]), k)
+        return near, index
+
+    def _scores(self, query: Tensor, begin: int, end: int) -> Tensor:
+        """Scores [Q, end - begin] of some rows: cosine, or (|q|^2 - d^2) / 2 without the |q|^2."""
+        rows, offset = self.factors[begin:end], self.offset[begin:end]
+        if torch.get_float32_matmul_precision() != "highest":  # not even float32 then
+            rows, offset = rows.double(), offset.double()
+        with torch.autocast(rows.device.type, enabled=False):
+            if self.metric == "euclidean":
+                return torch.addmm(offset, query.to(rows.dtype), rows.T)
+            # 0 x inf is NaN: a zero vector is similar to nothing
+            return (self._unit(query).to(rows.dtype) @ rows.T).mul_(offset).nan_to_num_(-torch.inf)
+
+    def _best(self, query: Tensor, count: int) -> tuple[Tensor, Tensor]:
+        """The best scores of each query and their rows, [Q, count], falling."""
+        chunk = max(count, SCAN_ENTRIES // max(1, len(query)))
+        best, index = self._scores(query, 0, chunk).topk(count, dim=-1)
+        for begin in range(chunk, len(self.rows), chunk):
+            score = self._scores(query, begin, begin + chunk)
+            better = score > best[:, -1:]
+            if better.any():
+                most = min(count, int(better.sum(-1).amax()))
+                score, place = score.topk(most, dim=-1)
+                best, order = torch.cat([best, score], -1).topk(count, dim=-1)
+                index = torch.cat([index, place + begin], -1).gather(-1, order)
         return best, index
 
+    def _unit(self, query: Tensor) -> Tensor:
+        return query / query.norm(dim=-1, keepdim=True).clamp_min(1e-300)
 
-def _leading(near: Tensor, k: int) -> tuple[Tensor, Tensor]:
-    """Top k of [Q, C], where of equal values at the border those in the lower places are taken."""
-    if k == near.shape[-1]:
-        return near, torch.arange(k, device=near.device).expand(len(near), k)
-    border = near.topk(k, dim=-1, sorted=False).values.amin(-1, keepdim=True)
-    above = near > border
-    room = k - above.sum(-1, keepdim=True)
-    equal = near == border
-    take = above | (equal & (equal.cumsum(-1) <= room))  # exactly k a row
-    place = take.nonzero()[:, 1].reshape(len(near), k)
-    return near.gather(-1, place), place
+    def _least_score(self, query: Tensor, near: Tensor) -> Tensor:
+        """What a row as similar as ``near`` [Q] scores at least; [Q]."""
+        # twice the bound on rounding: of D products and their sums, of query and offset
+        terms = 2 * (query.shape[-1] + 4)
+        share, fine = (terms * torch.finfo(d).eps for d in (self.factors.dtype, torch.float64))
+        if self.metric == "cosine":
+            return near - share
+        size = query.norm(dim=-1)
+        distance = 1 / near - 1
+        distance = distance + fine * (1 + distance)  # as far as rows can be that are as similar
+        wrong = share * self.largest * (size + self.largest) + fine * size.square()
+        least = (size.square() - distance.square()) / 2 - wrong
+        return torch.where(size < HUGE, least, -torch.inf)
+
+    def _above(self, query: Tensor, least: float, k: int) -> tuple[Tensor, Tensor]:
+        """The k best of one query [1, D] among all rows that score ``least`` or more."""
+        chunk = range(0, len(self.rows), SCAN_ENTRIES)
+        fits = [~(self._scores(query, i, i + SCAN_ENTRIES)[0] < least) for i in chunk]
+        index = torch.cat(fits).nonzero().T  # [1, C]
+        near = similarity(query, self.rows[index[0]], self.metric)[None]
+        near, index = _order(near, index, k)
+        return index[0], near[0]
 
 
 class TreeIndex:
