@@ -38,7 +38,7 @@ class StepEstimator(TensorDictModuleBase):
 
     Args:
         normalizer (Normalizer): of states.
-        horizon (int): H.
+        horizon (int): H, that of :class:`RetrievalTargetModule`.
         width (int, optional): Defaults to ``256``.
         activation (str, optional): ``"softmax"``: classes exclude each other; ``"sigmoid"``: one
             against the rest, as the paper prints it. Defaults to ``"softmax"``.

@@ -66,8 +66,9 @@ class RetrievalTargetModule(TensorDictModuleBase):
 
     Args:
         database (ExpertDatabase): the demonstrations.
-        horizon (int, optional): H of the planner; a target is at most H - 1 recorded steps ahead.
-            Defaults to ``129``.
+        horizon (int, optional): H; a target is at most H - 1 recorded steps ahead. The planner's H,
+            or less: the paper's rule does not count the way, so that with a large one it leaves
+            what pays for what pays later. Defaults to ``129``.
         rule (str, optional): ``"highest"`` or ``"followed"``. Defaults to ``"highest"``.
         tolerance (float, optional): in units of return (the paper's eta). Defaults to ``0.0``.
         ahead (int, optional): steps looked ahead by ``"followed"``. Defaults to ``16``.
