@@ -72,6 +72,11 @@ def test_windows_shorter_than_the_horizon():
         draw_step_pairs(torch.zeros(2, 9, 3), horizon=33)
 
 
+def test_no_pairs():
+    with pytest.raises(ValueError, match="pairs is 0; expected one or more"):
+        draw_step_pairs(torch.zeros(2, 9, 3), pairs=0)
+
+
 def test_pairs_follow_the_generator():
     windows = torch.randn(20, 9, 2)
     first, second = (

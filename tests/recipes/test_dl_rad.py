@@ -333,6 +333,7 @@ def assert_error(ran, message):
         ("retrieval.paper.target.tolerance=-1", r"tolerance is -1; it must not be negative"),
         ("retrieval.paper.target.rule=lowest", r"rule is 'lowest'"),
         ("retrieval.followed.target.ahead=500", r"ahead is 500"),
+        ("loss.step_pairs=0", "pairs is 0; expected one or more from each window"),
         ("network.step_horizon=130", r"the horizon of 'target' is 130.*built for 129"),
         ("+retrieval.paper.target.horizon=65", r"the horizon of 'target' is 65.*step_horizon"),
         ("+retrieval.paper.estimator.horizon=65", r"the horizon of 'estimator' is 65"),

@@ -42,7 +42,7 @@ def draw_step_pairs(
         [B * pairs, 1] int64.
 
     Raises:
-        ValueError: the windows are shorter than ``horizon``.
+        ValueError: the windows are shorter than ``horizon``, or no pairs are asked for.
 
     Examples:
         >>> windows = torch.arange(9.0)[None, :, None].expand(4, 9, 1)
@@ -53,6 +53,8 @@ def draw_step_pairs(
     length, device = windows.shape[1], windows.device
     if horizon is None:
         horizon = length
+    if pairs < 1:
+        raise ValueError(f"pairs is {pairs}; expected one or more from each window.")
     if length < horizon:
         raise ValueError(
             f"windows of {length} states hold no pairs up to {horizon - 1} steps apart; draw "
