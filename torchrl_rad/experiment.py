@@ -132,15 +132,14 @@ def make_policies(
     shared = {**sizes, "planner": planner}
     policies = {BACKBONE: PolicyParts(build_policy(shared), shared)}
     for name, options in retrieval.items():
-        for part in ("target", "estimator"):
-            other = options[part].get("horizon", reach)
-            if other != reach:
-                raise ValueError(
-                    f"the horizon of {part!r} is {other} for {name!r}, not the step_horizon "
-                    f"{reach}; set network.step_horizon: all policies share one step estimator."
-                )
-        database = make_database(data, options)
         target = {"horizon": reach, **options["target"]}
+        if target["horizon"] != reach:
+            raise ValueError(
+                f"the horizon of 'target' is {target['horizon']} for {name!r}, not the "
+                f"step_horizon {reach}; set network.step_horizon: all policies share one step "
+                "estimator."
+            )
+        database = make_database(data, options)
         estimator = {"width": width, **options["estimator"]}
         description = {**shared, "target": target, "estimator": estimator}
         policy = build_policy(description, database)

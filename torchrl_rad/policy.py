@@ -84,9 +84,9 @@ def build_policy(
     if database is None:
         raise ValueError("this policy retrieves targets: pass the database.")
     select = RetrievalTargetModule(
-        database, out_keys=[*OUT_KEYS, "target_offset"], **{"horizon": horizon, **target}
+        database, out_keys=[*OUT_KEYS, "target_offset"], **{**target, "horizon": reach}
     )
-    estimator = StepEstimator(states, **{"horizon": reach, **estimator_options})
+    estimator = StepEstimator(states, **{**estimator_options, "horizon": reach})
     return TensorDictSequential(select, estimator, planner)
 
 

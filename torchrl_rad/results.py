@@ -132,7 +132,7 @@ def _merge(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     scores = [row["score"] for row in rows]
     pooled = np.concatenate([row["episode_scores"] for row in rows])
     merged = {
-        key: interval([np.nan if row[key] is None else row[key] for row in rows])[0]
+        key: interval([row[key] for row in rows])[0]  # None is NaN there
         for key in ("return", "success", "arrival", "share", "found", "similarity", "step_error")
         if all(key in row for row in rows)
     }

@@ -103,12 +103,17 @@ def test_scan_copies_no_rows():
 
 
 def test_scan_looks_at_few_rows_twice(monkeypatch):
-    # the proof holds for rows in general position: no second look
-    monkeypatch.setattr(ScanIndex, "_above", lambda *_: pytest.fail("a second look"))
+    # the proof holds for rows in general position, and cannot where rows beyond the spare ones tie
+    second, above = [], ScanIndex._above
+    monkeypatch.setattr(ScanIndex, "_above", lambda *args: second.append(1) or above(*args))
     generator = torch.Generator().manual_seed(0)
     rows = torch.randn(5000, 29, generator=generator)
     for metric in ("euclidean", "cosine"):
         ScanIndex(rows, metric).search(rows[:8] + 0.01, 50)
+        assert len(second) == 0
+        ScanIndex(rows[:1].expand(5000, 29), metric).search(rows[:8] + 0.01, 50)
+        assert len(second) == 8
+        second.clear()
 
 
 def test_tree_ties_at_the_last_place():

@@ -13,7 +13,7 @@ __all__ = ["Metric", "ScanIndex", "TreeIndex", "build_index", "similarity"]
 
 Metric = Literal["cosine", "euclidean"]
 
-SCAN_ENTRIES = 2**20  # scores that a search holds at a time
+SCAN_ENTRIES = 2**20  # scores, or entries of states, that a search holds at a time
 SPARE = 32  # rows ranked beyond k, at least
 TINY, HUGE = 1e-15, 1e15  # sizes whose squares float32 holds
 TREE_DIMS = 3  # beyond, a scan of k in the hundreds is faster
