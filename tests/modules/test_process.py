@@ -98,7 +98,7 @@ def test_a_perfect_network_recovers_the_data(name, steps, seed):
     process = make_process(name)
     target = process.target(clean, noise)
     mask = torch.zeros(3, 5, 1, dtype=torch.bool)
-    plan = sample_plan(process, lambda x, m, t: target, noise, clean, mask, steps)
+    plan = sample_plan(process, lambda x, step: target, noise, clean, mask, steps)
     torch.testing.assert_close(plan, clean, atol=1e-5, rtol=1e-5)
 
 

@@ -24,19 +24,33 @@ def test_inpaint_by_hand():
 @pytest.mark.parametrize("steps", [1, 4])
 def test_known_entries_hold_at_every_call_and_at_the_end(name, per_dim, steps):
     known, mask = known_entries(per_dim)
-    full, times = mask.expand(4, 5, 3), []
+    full, called = mask.expand(4, 5, 3), []
 
-    def network(sample, given, time):
-        assert torch.equal(sample[full], known[full]) and given is mask
-        assert time.shape == (1,)
-        times.append(float(time))
+    def network(sample, step):
+        assert torch.equal(sample[full], known[full])
+        called.append(step)
         return torch.randn_like(sample)
 
     process = make_process(name)
     plan = sample_plan(process, network, torch.randn(4, 5, 3), known, mask, steps)
     assert torch.equal(plan[full], known[full])
     assert plan.isfinite().all()
-    assert times == pytest.approx(process.grid(steps)[:-1])
+    assert called == list(range(steps))
+
+
+@pytest.mark.parametrize("name", PROCESSES)
+@pytest.mark.parametrize("free", [slice(1, 5), slice(1, 4), slice(0, 5), slice(2, 3)])
+def test_known_tokens_at_the_ends_need_no_prediction(name, free):
+    process, network = make_process(name), torch.nn.Linear(3, 3)
+    mask = torch.ones(4, 5, 1, dtype=torch.bool)
+    mask[:, free] = torch.rand(4, free.stop - free.start, 1) < 0.3
+    noise, known = torch.randn(2, 4, 5, 3)
+    with torch.no_grad():
+        some = sample_plan(
+            process, lambda x, step: network(x)[:, free], noise, known, mask, 3, free
+        )
+        whole = sample_plan(process, lambda x, step: network(x), noise, known, mask, 3)
+    torch.testing.assert_close(some, whole, rtol=0, atol=0)
 
 
 def test_euler_by_hand():
@@ -45,7 +59,7 @@ def test_euler_by_hand():
     expected = (1 + (1 - t)) * (1 + t)
     plan = sample_plan(
         make_process("flow"),
-        lambda x, mask, time: x,
+        lambda x, step: x,
         torch.ones(1, 1, 1),
         torch.zeros(1, 1, 1),
         torch.zeros(1, 1, 1, dtype=torch.bool),
@@ -60,7 +74,7 @@ def test_too_few_steps(steps):
     with pytest.raises(ValueError, match=f"steps is {steps}; a plan needs at least one"):
         sample_plan(
             make_process("flow"),
-            lambda x, mask, time: x,
+            lambda x, step: x,
             torch.ones(1, 1, 1),
             torch.ones(1, 1, 1),
             mask,

@@ -14,6 +14,7 @@ from torchrl.envs.utils import ExplorationType, exploration_type
 
 from torchrl_rad.data.database import ExpertDatabase
 from torchrl_rad.modules.dit import DiT
+from torchrl_rad.modules.frozen import FrozenCache, StepNetwork, is_hooked, step_network
 from torchrl_rad.modules.inverse import InverseDynamics
 from torchrl_rad.modules.levels import Level, plan_levels, plan_times
 from torchrl_rad.modules.normalizer import Normalizer
@@ -158,6 +159,7 @@ class DiffuserLitePlanner(TensorDictModuleBase):
             DiT(state_dim, level.tokens, width, heads, blocks) for level in self.levels
         )
         self.register_buffer("plan_times", plan_times(levels), persistent=False)
+        self._frozen = FrozenCache()
 
     @dispatch(auto_batch_size=False)
     @torch.no_grad()
@@ -168,7 +170,8 @@ class DiffuserLitePlanner(TensorDictModuleBase):
         state = torch.nan_to_num(observation, nan=0.0, posinf=0.0, neginf=0.0).reshape(-1, width)
         pins = self._pins(tensordict, len(state)) if self.targets else [None] * len(self.levels)
         plan = self.plan(state, pins)
-        action = self.inverse_dynamics(state, plan[:, 1]).float()  # also under autocast
+        with torch.autocast(state.device.type, enabled=False):  # too small to be faster
+            action = self.inverse_dynamics(state, plan[:, 1])
         tensordict.set(self.out_keys[0], plan.reshape(*shape, *plan.shape[1:]))
         tensordict.set(self.out_keys[1], action.reshape(*shape, action.shape[-1]))
         return tensordict
@@ -210,20 +213,38 @@ class DiffuserLitePlanner(TensorDictModuleBase):
 
     # the plan
 
+    def _networks(self, device: torch.device) -> list[StepNetwork]:
+        """The networks of the levels at the sampler's times; under autocast in its precision."""
+        lower = torch.is_autocast_enabled(device.type)
+        dtype = torch.get_autocast_dtype(device.type) if lower else None
+        times = self.process.grid(self.steps)[:-1]
+
+        def make() -> list[StepNetwork]:
+            return [step_network(network, times, dtype) for network in self.networks]
+
+        if device.type != "cpu":
+            return make()  # nothing is packed there, and to compare weights would wait for it
+        hooked = tuple(map(is_hooked, self.networks))
+        return self._frozen.get(self.networks, (dtype, hooked, *times), make)
+
     def plan(self, state: Tensor, pins: Sequence[Pin | None]) -> Tensor:
         """Plans [Q, L, S] for raw states [Q, S]; ``pins`` holds a :class:`Pin` or None a level."""
         seeded = torch.Generator(device=state.device).manual_seed(0) if self._is_seeded() else None
+        networks = self._networks(state.device)
         end: Tensor | None = None
         finished: list[Tensor] = []
-        for number, pin in enumerate(pins):
-            states = self._level(number, state, end, pin, seeded)  # [Q, n, S]
-            finished = [states, *(part[:, 2:] for part in finished[:1]), *finished[1:]]
-            end = states[:, 1]
+        with torch.autocast(state.device.type, enabled=False):
+            for number, pin in enumerate(pins):
+                network = networks[number]
+                states = self._level(number, network, state, end, pin, seeded)  # [Q, n, S]
+                finished = [states, *(part[:, 2:] for part in finished[:1]), *finished[1:]]
+                end = states[:, 1]
         return torch.cat(finished, 1)
 
     def _level(
         self,
         number: int,
+        network: StepNetwork,
         state: Tensor,
         end: Tensor | None,
         pin: Pin | None,
@@ -242,13 +263,16 @@ class DiffuserLitePlanner(TensorDictModuleBase):
             mask = mask | here[..., None]
         copies = self.candidates if number == 0 else 1
         many, many_mask = known.repeat_interleave(copies, 0), mask.repeat_interleave(copies, 0)
+        given = network.prepare(many_mask)
+        free = slice(1, tokens if end is None else tokens - 1)  # the others are known in all rows
         sample = sample_plan(
             self.process,
-            lambda x, m, t: self.networks(number, x, m, t),
+            lambda x, step: network(x, given, step, free),
             self._noise(len(state), copies, tokens, generator, state),
             self.normalizer(many),
             many_mask,
             self.steps,
+            free,
         )
         # exact in raw units: what is known is not sent through the normaliser and back
         raw = torch.where(many_mask, many, self.normalizer.inverse(sample))

@@ -91,6 +91,8 @@ class DiT(nn.Module):
             raise ValueError(
                 f"width is {width}; expected an even multiple of heads ({heads}), 4 or more."
             )
+        if blocks < 1:
+            raise ValueError(f"blocks is {blocks}; expected 1 or more.")
         self.width, self.mask_channel = width, mask_channel
         self.register_buffer("positions", sinusoids(torch.arange(float(tokens)), width))
         self.embed = nn.Linear(state_dim + mask_channel, width)

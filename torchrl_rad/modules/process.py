@@ -52,7 +52,7 @@ class RectifiedFlow:
         return [(i / steps) ** 1.5 for i in range(steps, -1, -1)]
 
     def step(self, sample: Tensor, prediction: Tensor, time: float, following: float) -> Tensor:
-        return sample + (time - following) * prediction
+        return torch.add(sample, prediction, alpha=time - following)
 
 
 class Diffusion:
@@ -79,6 +79,14 @@ class Diffusion:
         alpha = alpha / math.cos(math.pi / 2 * self.SHIFT / (1 + self.SHIFT))
         return alpha, (1 - alpha.square()).clamp_min(0.0).sqrt()
 
+    def _numbers(self, time: float) -> tuple[float, float]:
+        """:meth:`alpha_sigma` without tensors, of which a step would wait for a dozen."""
+        angles = (
+            math.pi / 2 * (t + self.SHIFT) / (1 + self.SHIFT) for t in (min(time, self.LAST), 0.0)
+        )
+        alpha = math.cos(next(angles)) / math.cos(next(angles))
+        return alpha, math.sqrt(max(0.0, 1 - alpha * alpha))
+
     def corrupt(self, clean: Tensor, noise: Tensor, time: Tensor) -> Tensor:
         alpha, sigma = self.alpha_sigma(time)
         return alpha * clean + sigma * noise
@@ -92,9 +100,9 @@ class Diffusion:
     def step(self, sample: Tensor, prediction: Tensor, time: float, following: float) -> Tensor:
         if following == 0.0:
             return prediction
-        alpha, sigma = (value.to(sample.device) for value in self.alpha_sigma(time))
-        alpha_next, sigma_next = (value.to(sample.device) for value in self.alpha_sigma(following))
-        return alpha_next * prediction + sigma_next * (sample - alpha * prediction) / sigma
+        (alpha, sigma), (alpha_next, sigma_next) = self._numbers(time), self._numbers(following)
+        ratio = sigma_next / sigma
+        return torch.add(ratio * sample, prediction, alpha=alpha_next - ratio * alpha)
 
 
 def make_process(name: str) -> Process:

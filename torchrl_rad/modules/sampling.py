@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from itertools import pairwise
 
 import torch
 from torch import Tensor
@@ -19,11 +20,12 @@ def inpaint(values: Tensor, known: Tensor, mask: Tensor) -> Tensor:
 
 def sample_plan(
     process: Process,
-    network: Callable[[Tensor, Tensor, Tensor], Tensor],
+    network: Callable[[Tensor, int], Tensor],
     noise: Tensor,
     known: Tensor,
     mask: Tensor,
     steps: int,
+    free: slice = slice(None),
 ) -> Tensor:
     """Turns noise into plans that hold the known entries.
 
@@ -32,11 +34,15 @@ def sample_plan(
 
     Args:
         process (Process): the generative process.
-        network (callable): (sample [B, L, D], mask, time [1]) -> prediction [B, L, D].
+        network (callable): (sample [B, L, D], number of the step) -> prediction [B, f, D]. What
+            depends on the step alone, such as the code of ``process.grid(steps)[step]``, can be
+            made beforehand, once for all calls.
         noise (Tensor): [B, L, D].
         known (Tensor): [B, L, D], read where ``mask`` is True.
         mask (Tensor): bool [B, L, 1] or [B, L, D].
         steps (int): calls of the network.
+        free (slice, optional): f tokens next to each other that are to be predicted; the others are
+            known. Defaults to all.
 
     Returns:
         Plans, [B, L, D].
@@ -48,15 +54,18 @@ def sample_plan(
         >>> from torchrl_rad.modules.process import RectifiedFlow
         >>> noise = torch.zeros(1, 3, 1)
         >>> known, mask = torch.ones(1, 3, 1), torch.tensor([True, False, False])[None, :, None]
-        >>> network = lambda x, mask, time: x + 2.0
+        >>> network = lambda x, step: x + 2.0
         >>> sample_plan(RectifiedFlow(), network, noise, known, mask, steps=1).squeeze()
         tensor([1., 2., 2.])
     """
     if steps < 1:
         raise ValueError(f"steps is {steps}; a plan needs at least one inference step.")
     sample = inpaint(noise, known, mask)
-    grid = process.grid(steps)
-    for time, following in zip(grid[:-1], grid[1:], strict=True):
-        prediction = network(sample, mask, torch.full((1,), time, device=sample.device))
-        sample = inpaint(process.step(sample, prediction, time, following), known, mask)
+    begin, end, _ = free.indices(sample.shape[1])
+    part, known, mask = sample[:, begin:end], known[:, begin:end], mask[:, begin:end]
+    before, after = sample[:, :begin], sample[:, end:]
+    for step, (time, following) in enumerate(pairwise(process.grid(steps))):
+        prediction = network(sample, step)
+        part = inpaint(process.step(part, prediction, time, following), known, mask)
+        sample = torch.cat([before, part, after], 1)
     return sample

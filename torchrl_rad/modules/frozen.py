@@ -1,0 +1,255 @@
+"""Networks at fixed weights: what depends on weights and time alone is computed once."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Hashable, Iterable, Sequence
+from operator import is_
+from typing import Any, Protocol, cast
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from torchrl_rad.modules.dit import Block, DiT, sinusoids
+
+__all__ = [
+    "FrozenCache",
+    "FrozenDiT",
+    "FrozenLinear",
+    "PlainNetwork",
+    "StepNetwork",
+    "is_hooked",
+    "step_network",
+]
+
+
+class StepNetwork(Protocol):
+    """A denoising network at the times of a sampler: what needs no noisy sample is prepared."""
+
+    def prepare(self, mask: Tensor) -> Tensor:
+        """What depends on the mask [B, n, 1] of the known tokens alone."""
+
+    def __call__(self, x: Tensor, prepared: Tensor, step: int, free: slice) -> Tensor:
+        """Predicts [B, f, S] for the f tokens in ``free``, those whose values are asked for.
+
+        Args:
+            x (Tensor): noisy states [B, n, S].
+            prepared (Tensor): of :meth:`prepare`.
+            step (int): number of the time.
+            free (slice): of the tokens.
+        """
+
+
+def step_network(
+    network: nn.Module, times: Sequence[float], dtype: torch.dtype | None = None
+) -> StepNetwork:
+    """A :class:`FrozenDiT`; a :class:`PlainNetwork` where something else has to be called."""
+    if type(network) is DiT and not is_hooked(network):
+        return FrozenDiT(network, times, dtype)
+    return PlainNetwork(network, times, dtype)
+
+
+def is_hooked(network: nn.Module) -> bool:
+    """Whether somebody wants to see the calls of a network."""
+    return bool(network._forward_hooks or network._forward_pre_hooks)
+
+
+class PlainNetwork:
+    """Calls a network (x [B, n, S], mask, time [1]) -> [B, n, S] as it is.
+
+    Args:
+        network (nn.Module): any.
+        times (sequence of float): of the process, one a step.
+        dtype (torch.dtype, optional): of autocast. Defaults to none.
+
+    Examples:
+        >>> plain, mask = PlainNetwork(DiT(4, tokens=5), [1.0]), torch.zeros(3, 5, 1).bool()
+        >>> plain(torch.randn(3, 5, 4), plain.prepare(mask), 0, slice(1, 5)).shape
+        torch.Size([3, 4, 4])
+    """
+
+    def __init__(
+        self, network: nn.Module, times: Sequence[float], dtype: torch.dtype | None = None
+    ):
+        self.network, self.times, self.dtype = network, times, dtype
+
+    def prepare(self, mask: Tensor) -> Tensor:
+        return mask
+
+    def __call__(self, x: Tensor, prepared: Tensor, step: int, free: slice) -> Tensor:
+        with torch.autocast(x.device.type, self.dtype, self.dtype is not None):
+            time = torch.full((1,), self.times[step], device=x.device)
+            return self.network(x, prepared, time)[:, free].to(x.dtype)
+
+
+class FrozenLinear:
+    """A linear layer whose weights lie as the product wants to read them.
+
+    With few rows a product takes as long as reading the weights does. In float32 they are
+    transposed; in bfloat16 on a CPU they are packed by oneDNN, as inductor's frozen graphs are.
+
+    Args:
+        weight (Tensor): [out, in].
+        bias (Tensor): [out].
+        dtype (torch.dtype, optional): of the product. Defaults to that of the weight.
+
+    Examples:
+        >>> linear = FrozenLinear(torch.tensor([[1.0, 2.0]]), torch.tensor([3.0]))
+        >>> linear(torch.tensor([[1.0, 1.0]]))
+        tensor([[6.]])
+    """
+
+    def __init__(self, weight: Tensor, bias: Tensor, dtype: torch.dtype | None = None):
+        self.dtype = dtype = weight.dtype if dtype is None else dtype
+        weight, self.bias = weight.detach().to(dtype), bias.detach().to(dtype)
+        self.product = _packed_product() if weight.is_cpu and dtype is torch.bfloat16 else None
+        if self.product is not None:
+            self.weight = torch.ops.mkldnn._reorder_linear_weight(weight.contiguous())
+        else:  # on a GPU the transposed view is read as fast
+            self.weight = weight.T.contiguous() if weight.is_cpu else weight.T
+
+    def __call__(self, x: Tensor, gelu: bool = False) -> Tensor:
+        """[M, out] of rows [M, in], through the tanh form of GELU if asked for."""
+        x = x.to(self.dtype)
+        if self.product is not None:
+            name, form = ("gelu", "tanh") if gelu else ("none", "")
+            return self.product(x, self.weight, self.bias, name, [], form)
+        x = torch.addmm(self.bias, x, self.weight)
+        return F.gelu(x, approximate="tanh") if gelu else x
+
+
+def _packed_product() -> Callable[..., Tensor] | None:
+    """OneDNN's product of bfloat16 rows and a packed matrix, where this machine has it."""
+    try:  # these are not public, so they may go
+        if torch.ops.mkldnn._is_mkldnn_bf16_supported():
+            return torch.ops.mkldnn._linear_pointwise.default
+    except AttributeError:
+        pass
+    return None
+
+
+class FrozenBlock:
+    """A :class:`~torchrl_rad.modules.dit.Block` at some times of the process.
+
+    Scale and shift become weight and bias of the normalisation.
+    """
+
+    def __init__(self, block: Block, condition: Tensor, dtype: torch.dtype | None):
+        parts = block.modulation(condition).chunk(6, -1)  # each [K, W]
+        shift, scale, gate, shift_mlp, scale_mlp, gate_mlp = (part.unbind(0) for part in parts)
+        self.before = [(1 + a, b) for a, b in zip(scale, shift, strict=True)]
+        self.before_mlp = [(1 + a, b) for a, b in zip(scale_mlp, shift_mlp, strict=True)]
+        self.gate, self.gate_mlp, self.heads = gate, gate_mlp, block.heads
+        up, _, down = cast(Iterable[nn.Linear], block.mlp)
+        self.qkv, self.out, self.up, self.down = (
+            FrozenLinear(layer.weight, layer.bias, dtype)
+            for layer in (block.qkv, block.out, up, down)
+        )
+
+    def __call__(self, x: Tensor, step: int, tokens: int, free: slice | None = None) -> Tensor:
+        """[B * n, W] to [B * n, W]; of the tokens in ``free`` only, if it is given."""
+        width = x.shape[-1:]
+        rows = len(x) // tokens
+        h = self.qkv(F.layer_norm(x, width, *self.before[step], eps=1e-6)).to(x.dtype)
+        qkv = h.view(rows, tokens, 3, self.heads, width[0] // self.heads).permute(2, 0, 3, 1, 4)
+        query, key, value = qkv.unbind(0)  # each [B, heads, n, E]
+        if free is not None:
+            query, x = query[:, :, free], x.view(rows, tokens, *width)[:, free].flatten(0, 1)
+        mixed = F.scaled_dot_product_attention(query, key, value).transpose(1, 2)
+        x = torch.addcmul(x, self.gate[step], self.out(mixed.reshape(x.shape)))
+        h = F.layer_norm(x, width, *self.before_mlp[step], eps=1e-6)
+        return torch.addcmul(x, self.gate_mlp[step], self.down(self.up(h, gelu=True)))
+
+
+class FrozenDiT:
+    """A :class:`~torchrl_rad.modules.dit.DiT` at its present weights and the times of a sampler.
+
+    Its predictions are those of the network: in float32 but for the order of summation, in bfloat16
+    products of matrices are rounded (the residual stream, attention, embedding and head are not).
+
+    Args:
+        network (DiT): copied; later changes of its weights do not show.
+        times (sequence of float): of the process, one a step.
+        dtype (torch.dtype, optional): of the large products. Defaults to that of the weights.
+
+    Examples:
+        >>> network = DiT(state_dim=4, tokens=5)
+        >>> frozen, mask = FrozenDiT(network, [1.0, 0.5]), torch.zeros(3, 5, 1, dtype=torch.bool)
+        >>> x = torch.randn(3, 5, 4)
+        >>> frozen(x, frozen.prepare(mask), step=1, free=slice(1, 5)).shape
+        torch.Size([3, 4, 4])
+    """
+
+    @torch.no_grad()
+    def __init__(self, network: DiT, times: Sequence[float], dtype: torch.dtype | None = None):
+        with torch.autocast(network.positions.device.type, enabled=False):
+            time = torch.tensor(times, device=network.positions.device)
+            codes = sinusoids(1000.0 * time, network.width).to(network.positions.dtype)
+            condition = network.time(codes)  # [K, W]
+            self.blocks = [FrozenBlock(b, condition, dtype) for b in network.blocks]  # type: ignore
+            shift, scale = network.modulation(condition).chunk(2, -1)
+            self.before = list(zip((1 + scale).unbind(0), shift.unbind(0), strict=True))
+        embed, entries = network.embed, network.embed.in_features - network.mask_channel
+        self.positions = network.positions + embed.bias  # [n, W]
+        self.embed = embed.weight[:, :entries].T.contiguous()
+        self.mask = embed.weight[:, entries:].T.contiguous()  # [1, W], or [0, W] without mask
+        self.head = FrozenLinear(network.head.weight, network.head.bias)
+
+    def prepare(self, mask: Tensor) -> Tensor:
+        """Positions, bias and mask in the embedding, [B * n, W]."""
+        embedded = self.positions.expand(len(mask), -1, -1)
+        if len(self.mask):
+            embedded = embedded + mask * self.mask
+        return embedded.flatten(0, 1)
+
+    def __call__(self, x: Tensor, prepared: Tensor, step: int, free: slice) -> Tensor:
+        """As :meth:`StepNetwork.__call__`."""
+        rows, tokens = x.shape[:2]
+        h = torch.addmm(prepared, x.flatten(0, 1), self.embed)  # [B * n, W]
+        for block in self.blocks[:-1]:
+            h = block(h, step, tokens)
+        h = self.blocks[-1](h, step, tokens, free)
+        h = F.layer_norm(h, h.shape[-1:], *self.before[step], eps=1e-6)
+        return self.head(h).view(rows, len(range(tokens)[free]), x.shape[-1])
+
+
+class FrozenCache:
+    """Keeps what was made from a module's weights for as long as these stay the same.
+
+    Not every write on a parameter raises its version (fused optimisers and writes through ``.data``
+    do not), so the weights' vectors and the first row of each matrix are compared too. What no
+    comparison of these shows is a write through ``.data`` that leaves them all as they are.
+
+    Examples:
+        >>> cache, network = FrozenCache(), nn.Linear(2, 1)
+        >>> first = cache.get(network, "sum", lambda: float(network.weight.sum()))
+        >>> network.weight.data += 1.0
+        >>> cache.get(network, "sum", lambda: float(network.weight.sum())) == first
+        False
+    """
+
+    def __init__(self) -> None:
+        self.parameters: list[nn.Parameter] = []
+        self.state: list[tuple[int, int]] = []
+        self.samples: list[Tensor] = []
+        self.before = torch.empty(0)
+        self.made: dict[Hashable, Any] = {}
+
+    def __reduce__(self):
+        return FrozenCache, ()  # copies and pickles are empty
+
+    @torch.no_grad()
+    def get(self, module: nn.Module, key: Hashable, make: Callable[[], Any]) -> Any:
+        """What ``make()`` gave for ``key`` at the module's present weights."""
+        parameters = list(module.parameters())
+        state = [(p.data_ptr(), p._version) for p in parameters]
+        same = state == self.state and all(map(is_, parameters, self.parameters))
+        if not same:
+            self.parameters, self.state = parameters, state
+            self.samples = [p.detach().flatten() if p.ndim < 2 else p[0] for p in parameters]
+        sample = torch.cat(self.samples)
+        if not same or not torch.equal(sample, self.before):
+            self.before, self.made = sample, {}
+        if key not in self.made:
+            self.made[key] = make()
+        return self.made[key]
