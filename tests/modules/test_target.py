@@ -255,7 +255,7 @@ def test_nothing_is_added_between_the_search_and_the_reading(monkeypatch):
 
         return call
 
-    monkeypatch.setattr(made.sampler, "nearest", watched(made.sampler.nearest))
+    monkeypatch.setattr(made.sampler, "best", watched(made.sampler.best))
     monkeypatch.setattr(select, "_read", watched(select._read))
     ask(select, queries())
     assert free == [False, False]  # extend, which takes this lock, would have to wait

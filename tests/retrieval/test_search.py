@@ -7,7 +7,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from torchrl_rad.retrieval import ScanIndex, TreeIndex, search, similarity
-from torchrl_rad.retrieval.search import build_index
+from torchrl_rad.retrieval.backends import build_index
+from torchrl_rad.retrieval.lists import ListIndex
 
 from ..oracle import ranking
 
@@ -192,8 +193,9 @@ def test_zero_vectors_come_last_for_cosine():
 
 def test_auto_takes_the_tree_for_few_dims_only():
     assert isinstance(build_index(torch.zeros(4, 3), "euclidean", "auto"), TreeIndex)
-    assert isinstance(build_index(torch.zeros(4, 4), "euclidean", "auto"), ScanIndex)
-    assert isinstance(build_index(torch.zeros(4, 2), "cosine", "auto"), ScanIndex)
+    assert isinstance(build_index(torch.zeros(4, 4), "euclidean", "auto"), ListIndex)
+    assert isinstance(build_index(torch.zeros(4, 2), "cosine", "auto"), ListIndex)
+    assert isinstance(build_index(torch.zeros(4, 4), "euclidean", "scan"), ScanIndex)
     assert isinstance(build_index(torch.zeros(4, 9), "euclidean", "tree"), TreeIndex)
 
 

@@ -208,19 +208,23 @@ class RetrievalTargetModule(TensorDictModuleBase):
             return tuple(torch.cat(column) for column in zip(*parts, strict=True))  # type: ignore
         database, device = self.database, query.device
         with database.lock:
-            rows, near = database.sampler.nearest(database.storage, query)  # [Q, k]
-            if rows.numel() == 0:
+            if len(database) == 0:
                 none = torch.full((len(query),), -1, device=device)
                 return none, torch.full_like(none, -torch.inf, dtype=torch.float32), none * 0
-            columns = self._prepare()
-        valid = near >= database.sampler.threshold
-        target, place = columns.rule(rows.clamp_min(0), valid)
-        hit = valid[:, 0]  # the most similar comes first
-        place = torch.where(hit[:, None], place, 0)
-        similarity = near.gather(-1, place).squeeze(-1).float()
-        offset = torch.where(hit, target - rows.gather(-1, place).squeeze(-1), 0)
+            columns, found = self._prepare(), (database.storage, query)
+            if isinstance(columns.rule, RankedRule):  # the order of all neighbours is not needed
+                row, near, hit = database.sampler.best(*found, columns.rule.rank)
+                target = columns.rule.target.index_select(0, row.clamp_min(0))
+            else:
+                rows, nears = database.sampler.nearest(*found)  # [Q, k]
+                valid = nears >= database.sampler.threshold
+                target, place = columns.rule(rows.clamp_min(0), valid)
+                hit = valid[:, 0]  # the most similar comes first
+                place = torch.where(hit[:, None], place, 0)
+                row, near = rows.gather(-1, place)[:, 0], nears.gather(-1, place)[:, 0]
         index = torch.where(hit, target, -1)
-        return index.to(device), similarity.to(device), offset.to(device)
+        offset = torch.where(hit, target - row, 0)
+        return index.to(device), near.float().to(device), offset.to(device)
 
     def _prepare(self) -> _Columns:
         """The columns of the database as it is; made anew when its search structure was."""

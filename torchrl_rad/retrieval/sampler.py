@@ -11,7 +11,8 @@ from torch import Tensor
 from torchrl.data.replay_buffers.samplers import Sampler
 
 from torchrl_rad.retrieval import search
-from torchrl_rad.retrieval.search import Metric, ScanIndex, TreeIndex, build_index
+from torchrl_rad.retrieval.backends import BACKENDS, SearchIndex, build_index
+from torchrl_rad.retrieval.choice import Metric, choose, similarity
 
 __all__ = ["RetrievalSampler", "storage_revision"]
 
@@ -61,7 +62,7 @@ class RetrievalSampler(Sampler):
     """
 
     _revision: tuple | None
-    _index: ScanIndex | TreeIndex | None
+    _index: SearchIndex | None
     _scale: tuple[Tensor, Tensor] | None
     _width: int  # of a state in the storage
 
@@ -81,8 +82,8 @@ class RetrievalSampler(Sampler):
     def _configure(self, metric, dims, k, threshold, normalize, backend, key) -> None:
         if metric not in ("cosine", "euclidean"):
             raise ValueError(f"metric is {metric!r}; expected 'cosine' or 'euclidean'.")
-        if backend not in ("auto", "scan", "tree"):
-            raise ValueError(f"backend is {backend!r}; expected 'auto', 'scan' or 'tree'.")
+        if backend not in BACKENDS:
+            raise ValueError(f"backend is {backend!r}; expected one of {BACKENDS}.")
         if k < 1:
             raise ValueError(f"k is {k}; at least one neighbour is needed.")
         if not 0.0 <= threshold <= 1.0:
@@ -153,6 +154,67 @@ class RetrievalSampler(Sampler):
         if count == 0:
             rows = torch.full((len(query), 0), -1)
             return rows, torch.empty(len(query), 0, dtype=torch.float64)
+        index, query, finite = self._ready(storage, query)
+        k = min(self.k, count)
+        near, rows = (
+            torch.cat(p)
+            for p in zip(*(index.search(q, k) for q in self._parts(query, k)), strict=True)
+        )
+        if finite is not None:
+            near, rows = torch.where(finite, near, -torch.inf), torch.where(finite, rows, -1)
+        return rows, near
+
+    def best(self, storage: Any, query: Tensor, rank: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """The neighbour of the highest rank of each query [Q, S]; of equals the most similar.
+
+        The same as looking for it among :meth:`nearest`, without putting these in order.
+
+        Args:
+            storage (Storage): where the rows are; not empty.
+            query (Tensor): [Q, S] in raw units.
+            rank (Tensor): int [N], not negative, of each row.
+
+        Returns:
+            Row, int64 [Q], its similarity, float64 [Q], and bool [Q] whether it is a neighbour: if
+            not, it is the most similar row, or -1 and -inf for a query with NaN or Inf.
+        """
+        index, query, finite = self._ready(storage, query)
+        k = min(self.k, len(storage))
+        row, near, hit = (
+            torch.cat(p)
+            for p in zip(
+                *(self._best(index, q, k, rank) for q in self._parts(query, k)), strict=True
+            )
+        )
+        if finite is not None:
+            finite = finite[:, 0]
+            near, row = torch.where(finite, near, -torch.inf), torch.where(finite, row, -1)
+            hit &= finite
+        return row, near, hit
+
+    def _best(
+        self, index: SearchIndex, query: Tensor, k: int, rank: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        found = index.candidates(query, k)
+        row, sure = choose(found, rank, self.threshold, index.metric, k)
+        near = similarity(query, index.rows.index_select(0, row), index.metric)
+        hit = torch.ones_like(sure)
+        if not sure.all():
+            doubt = ~sure
+            nears, rows = index.search(query[doubt], k)
+            valid = nears >= self.threshold
+            # the first place of the largest: rows come by similarity
+            place = torch.where(valid, rank[rows], -1).argmax(-1, keepdim=True)
+            near[doubt] = nears.gather(-1, place)[:, 0]
+            row[doubt], hit[doubt] = rows.gather(-1, place)[:, 0], valid[:, 0]
+        return row, near, hit
+
+    def _parts(self, query: Tensor, k: int) -> tuple[Tensor, ...]:
+        """Queries by so many that the states of their neighbours are SCAN_ENTRIES at most."""
+        return query.split(max(1, search.SCAN_ENTRIES // (k * max(1, query.shape[-1]))))
+
+    def _ready(self, storage: Any, query: Tensor) -> tuple[SearchIndex, Tensor, Tensor | None]:
+        """The search structure, queries as it wants them, and which are finite if not all are."""
         index = self.build(storage)
         if query.shape[-1] != self._width:
             raise ValueError(
@@ -164,15 +226,7 @@ class RetrievalSampler(Sampler):
         whole = bool(finite.all())
         if not whole:
             query = torch.where(finite, query, 0.0)
-        query, k = self._prepare(query), min(self.k, count)
-        most = max(1, search.SCAN_ENTRIES // (k * max(1, query.shape[-1])))
-        parts = [index.search(part, k) for part in query.split(most)]
-        near, rows = parts[0]
-        if len(parts) > 1:
-            near, rows = (torch.cat(part) for part in zip(*parts, strict=True))
-        if not whole:
-            near, rows = torch.where(finite, near, -torch.inf), torch.where(finite, rows, -1)
-        return rows, near
+        return index, self._prepare(query), None if whole else finite
 
     def _prepare(self, states: Tensor) -> Tensor:
         if self.dims is not None:
@@ -182,7 +236,7 @@ class RetrievalSampler(Sampler):
             states = (states.double() - mean) / deviation
         return states
 
-    def build(self, storage: Any) -> ScanIndex | TreeIndex:
+    def build(self, storage: Any) -> SearchIndex:
         """The search structure of the storage: the same object until the storage changes."""
         revision = storage_revision(storage)
         if self._index is None or self._revision != revision:

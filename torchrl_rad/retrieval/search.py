@@ -1,78 +1,19 @@
-"""Exact nearest rows: a chunked scan for any width, a k-d tree for two or three dims."""
+"""Exact nearest rows: a chunked scan for any width, a k-d tree for few dims."""
 
 from __future__ import annotations
-
-from typing import Literal
 
 import numpy as np
 import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-__all__ = ["Metric", "ScanIndex", "TreeIndex", "build_index", "similarity"]
+from torchrl_rad.retrieval.choice import Candidates, Metric, most_similar, ordered, similarity
 
-Metric = Literal["cosine", "euclidean"]
+__all__ = ["ScanIndex", "TreeIndex"]
 
 SCAN_ENTRIES = 2**20  # scores, or entries of states, that a search holds at a time
 SPARE = 32  # rows ranked beyond k, at least
 TINY, HUGE = 1e-15, 1e15  # sizes whose squares float32 holds
-TREE_DIMS = 3  # beyond, a scan of k in the hundreds is faster
-
-
-def similarity(query: Tensor, rows: Tensor, metric: Metric) -> Tensor:
-    r"""Similarity of states, in float64 and the same to the last bit for every batching.
-
-    ``cosine`` is :math:`x \cdot s / (|x||s|)`, -inf where a vector is zero; ``euclidean`` is
-    :math:`1 / (1 + |x - s|)`.
-
-    Args:
-        query (Tensor): [..., D], broadcast against ``rows``.
-        rows (Tensor): [..., D].
-        metric (str): ``"cosine"`` or ``"euclidean"``.
-
-    Returns:
-        float64 [...].
-
-    Examples:
-        >>> similarity(torch.tensor([0.0, 0.0]), torch.tensor([[3.0, 4.0]]), "euclidean")
-        tensor([0.1667], dtype=torch.float64)
-        >>> similarity(torch.tensor([1.0, 0.0]), torch.tensor([[2.0, 0.0], [0.0, 0.0]]), "cosine")
-        tensor([1., -inf], dtype=torch.float64)
-    """
-    query, rows = query.double(), rows.double()
-    if metric == "euclidean":
-        return 1.0 / (1.0 + _sqrt(_sum_last((query - rows).square())))
-    product = _sum_last(query * rows)
-    size = _sqrt(_sum_last(query.square())) * _sqrt(_sum_last(rows.square()))
-    return torch.where(size > 0, product / size.clamp_min(1e-300), -torch.inf)
-
-
-def _sqrt(values: Tensor) -> Tensor:
-    # torch's own on a CPU can be off by the last bit, which decides ties
-    if values.is_cpu and not values.requires_grad:
-        return torch.from_numpy(np.asarray(np.sqrt(values.numpy())))
-    return values.sqrt()
-
-
-def _sum_last(values: Tensor) -> Tensor:
-    # one dim after the other: torch.sum orders its additions by the shape, so that a batch could
-    # differ from one row
-    total = values[..., 0]
-    for dim in range(1, values.shape[-1]):
-        total = total + values[..., dim]
-    return total
-
-
-def _order(similarity: Tensor, index: Tensor, k: int) -> tuple[Tensor, Tensor]:
-    """The k most similar of each row of candidates [Q, C], ties by the lower index: two [Q, k]."""
-    similarity, order = similarity.sort(dim=-1, descending=True, stable=True)
-    index = index.gather(-1, order)
-    tied = (similarity[:, 1:] == similarity[:, :-1]).any(-1)
-    if tied.any():
-        places, order = index[tied].sort(dim=-1)
-        near, ranked = similarity[tied].gather(-1, order).sort(dim=-1, descending=True, stable=True)
-        similarity[tied], index[tied] = near, places.gather(-1, ranked)
-    return similarity[:, :k], index[:, :k]
 
 
 class ScanIndex:
@@ -114,16 +55,24 @@ class ScanIndex:
             Similarities, float64 [Q, k], falling, and row numbers, int64 [Q, k]; ties by the lower
             row.
         """
+        found = self.candidates(query, k)
         query = query.double()
-        kept = min(len(self.rows), k + max(SPARE, k // 4))
-        score, index = self._best(query, kept)
-        near, index = _order(similarity(query[:, None], self.rows[index], self.metric), index, k)
-        if kept < len(self.rows):
-            least = self._least_score(query, near[:, -1])
-            for row in (~(score[:, -1] < least)).nonzero().flatten().tolist():  # ties, mostly
-                one = query[row : row + 1]
-                index[row], near[row] = self._above(one, float(least[row]), k)
+        near, index, least = ordered(found, query, self.rows, self.metric, k)
+        for row in (~(found.score[:, -1] < least)).nonzero().flatten().tolist():  # ties, mostly
+            near[row], index[row] = self._above(query[row : row + 1], float(least[row]), k)
         return near, index
+
+    def candidates(self, query: Tensor, k: int) -> Candidates:
+        """Rows among which the k most similar ones are; ``query`` as in :meth:`search`."""
+        query = query.double()
+        score, index = self.best(query, self.kept(k))
+        square = query.square().sum(-1)
+        base = square / 2 if self.metric == "euclidean" else torch.ones_like(square)
+        return Candidates(score.double(), index, self.error(query), base)
+
+    def kept(self, k: int) -> int:
+        """How many candidates there are for k neighbours."""
+        return min(len(self.rows), k + max(SPARE, k // 4))
 
     def _scores(self, query: Tensor, begin: int, end: int) -> Tensor:
         """Scores [Q, end - begin] of some rows: cosine, or (|q|^2 - d^2) / 2 without the |q|^2."""
@@ -134,9 +83,9 @@ class ScanIndex:
             if self.metric == "euclidean":
                 return torch.addmm(offset, query.to(rows.dtype), rows.T)
             # 0 x inf is NaN: a zero vector is similar to nothing
-            return (self._unit(query).to(rows.dtype) @ rows.T).mul_(offset).nan_to_num_(-torch.inf)
+            return (self.unit(query).to(rows.dtype) @ rows.T).mul_(offset).nan_to_num_(-torch.inf)
 
-    def _best(self, query: Tensor, count: int) -> tuple[Tensor, Tensor]:
+    def best(self, query: Tensor, count: int) -> tuple[Tensor, Tensor]:
         """The best scores of each query and their rows, [Q, count], falling."""
         chunk = max(count, SCAN_ENTRIES // max(1, len(query)))
         best, index = self._scores(query, 0, chunk).topk(count, dim=-1)
@@ -150,22 +99,20 @@ class ScanIndex:
                 index = torch.cat([index, place + begin], -1).gather(-1, order)
         return best, index
 
-    def _unit(self, query: Tensor) -> Tensor:
+    def unit(self, query: Tensor) -> Tensor:
+        """Vectors of length one; zeros stay."""
         return query / query.norm(dim=-1, keepdim=True).clamp_min(1e-300)
 
-    def _least_score(self, query: Tensor, near: Tensor) -> Tensor:
-        """What a row as similar as ``near`` [Q] scores at least; [Q]."""
+    def error(self, query: Tensor) -> Tensor:
+        """How wrong a score of each query [Q, D] can be; float64 [Q]."""
         # twice the bound on rounding: of D products and their sums, of query and offset
         terms = 2 * (query.shape[-1] + 4)
         share, fine = (terms * torch.finfo(d).eps for d in (self.factors.dtype, torch.float64))
-        if self.metric == "cosine":
-            return near - share
         size = query.norm(dim=-1)
-        distance = 1 / near - 1
-        distance = distance + fine * (1 + distance)  # as far as rows can be that are as similar
+        if self.metric == "cosine":
+            return torch.full_like(size, share)
         wrong = share * self.largest * (size + self.largest) + fine * size.square()
-        least = (size.square() - distance.square()) / 2 - wrong
-        return torch.where(size < HUGE, least, -torch.inf)
+        return torch.where(size < HUGE, wrong, torch.inf)
 
     def _above(self, query: Tensor, least: float, k: int) -> tuple[Tensor, Tensor]:
         """The k best of one query [1, D] among all rows that score ``least`` or more."""
@@ -173,8 +120,8 @@ class ScanIndex:
         fits = [~(self._scores(query, i, i + SCAN_ENTRIES)[0] < least) for i in chunk]
         index = torch.cat(fits).nonzero().T  # [1, C]
         near = similarity(query, self.rows[index[0]], self.metric)[None]
-        near, index = _order(near, index, k)
-        return index[0], near[0]
+        near, index = most_similar(near, index)
+        return near[0, :k], index[0, :k]
 
 
 class TreeIndex:
@@ -201,47 +148,40 @@ class TreeIndex:
 
     def search(self, query: Tensor, k: int) -> tuple[Tensor, Tensor]:
         """As :meth:`ScanIndex.search`."""
-        wanted = min(k + 1, len(self.rows))
-        distance, places = self.tree.query(query.double().numpy(), k=np.arange(1, wanted + 1))
-        if np.isinf(distance[:, -1:]).any():  # too far for the tree, which then finds nothing
+        found = self.candidates(query, k)
+        if found.score[:, -1:].isinf().any():  # too far for the tree, which then finds nothing
             return ScanIndex(self.rows, self.metric).search(query, k)
-        index = torch.from_numpy(places)
-        near = self.rows.index_select(0, index.view(-1)).view(*index.shape, self.rows.shape[-1])
-        near, index = _order(similarity(query[:, None], near, self.metric), index, wanted)
-        if wanted > k:
+        query = query.double()
+        near = self.rows.index_select(0, found.row.flatten()).view(
+            *found.row.shape, query.shape[-1]
+        )
+        near, index = most_similar(similarity(query[:, None], near, self.metric), found.row)
+        if index.shape[1] > k:
             # the tree is free in what it takes among rows as far as the last one: look around
             tied = near[:, k] >= near[:, k - 1] * (1 - 1e-12)
             if tied.any():
-                radius = distance[tied.numpy(), k]
+                radius = (-2 * found.score[tied, k]).sqrt().numpy()
                 near[tied, :k], index[tied, :k] = self._around(query[tied], radius, k)
         return near[:, :k], index[:, :k]
+
+    def candidates(self, query: Tensor, k: int) -> Candidates:
+        """As :meth:`ScanIndex.candidates`."""
+        query, wanted = query.double(), min(k + 1, len(self.rows))
+        distance, row = self.tree.query(query.numpy(), k=wanted)
+        score = torch.from_numpy(distance).view(len(query), wanted).square().mul_(-0.5)
+        error = 1e-12 * (1 + query.square().sum(-1) - score[:, -1])
+        row = torch.from_numpy(row).view(len(query), wanted)
+        return Candidates(score, row, error, torch.zeros_like(error))
 
     def _around(self, query: Tensor, radius: np.ndarray, k: int) -> tuple[Tensor, Tensor]:
         """All rows within the radius, ordered: exact among ties."""
         # a little more: distances so close give equal similarities
         found = self.tree.query_ball_point(query.double().numpy(), radius * (1 + 1e-9) + 1e-11)
-        results = []
+        nears, indices = [], []
         for row, candidates in zip(query, found, strict=True):
             index = torch.tensor(candidates)
             near = similarity(row, self.rows[index], self.metric)
-            results.append(_order(near[None], index[None], k))
-        return torch.cat([r[0] for r in results]), torch.cat([r[1] for r in results])
-
-
-def build_index(rows: Tensor, metric: Metric, backend: str) -> ScanIndex | TreeIndex:
-    """The search structure for rows [N, D].
-
-    ``backend`` is ``"scan"``, ``"tree"``, or ``"auto"`` for the faster of both.
-
-    Raises:
-        ValueError: a tree is asked for cosine similarity, or for rows that are not on the CPU.
-    """
-    fits = metric == "euclidean" and rows.device.type == "cpu"
-    if backend == "tree" and not fits:
-        raise ValueError(
-            f"backend='tree' needs metric='euclidean' and rows on the CPU; got metric={metric!r} "
-            f"on {rows.device}. Use backend='scan' or 'auto'."
-        )
-    if backend == "tree" or (backend == "auto" and fits and rows.shape[-1] <= TREE_DIMS):
-        return TreeIndex(rows)
-    return ScanIndex(rows, metric)
+            near, index = most_similar(near[None], index[None])
+            nears.append(near[:, :k])
+            indices.append(index[:, :k])
+        return torch.cat(nears), torch.cat(indices)

@@ -1,0 +1,58 @@
+"""Which search structure serves some rows."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+from torch import Tensor
+
+from torchrl_rad.retrieval.choice import Candidates, Metric
+from torchrl_rad.retrieval.lists import ListIndex
+from torchrl_rad.retrieval.search import ScanIndex, TreeIndex
+
+__all__ = ["BACKENDS", "SearchIndex", "build_index"]
+
+BACKENDS = ("auto", "scan", "tree")
+TREE_DIMS = 3  # beyond, a scan of k in the hundreds is faster
+
+
+class SearchIndex(Protocol):
+    """Rows that can be searched."""
+
+    rows: Tensor
+    metric: Metric
+
+    def search(self, query: Tensor, k: int) -> tuple[Tensor, Tensor]:
+        """The k most similar rows of each query, ties by the lower row.
+
+        Args:
+            query (Tensor): [Q, D], finite.
+            k (int): at most the number of rows.
+
+        Returns:
+            Similarities, float64 [Q, k], falling, and row numbers, int64 [Q, k].
+        """
+
+    def candidates(self, query: Tensor, k: int) -> Candidates:
+        """Rows among which the k most similar ones are, without their exact order."""
+
+
+def build_index(rows: Tensor, metric: Metric, backend: str) -> SearchIndex:
+    """The search structure for rows [N, D].
+
+    ``backend`` is ``"scan"``, ``"tree"``, or ``"auto"`` for what is fastest along a trajectory.
+
+    Raises:
+        ValueError: a tree is asked for cosine similarity, or for rows that are not on the CPU.
+    """
+    fits = metric == "euclidean" and rows.device.type == "cpu"
+    if backend == "tree" and not fits:
+        raise ValueError(
+            f"backend='tree' needs metric='euclidean' and rows on the CPU; got metric={metric!r} "
+            f"on {rows.device}. Use backend='scan' or 'auto'."
+        )
+    if backend == "tree" or (backend == "auto" and fits and rows.shape[-1] <= TREE_DIMS):
+        return TreeIndex(rows)
+    scan = ScanIndex(rows, metric)
+    # on a GPU a scan takes less time than the comparison of two queries
+    return ListIndex(scan) if backend == "auto" and rows.device.type == "cpu" else scan
