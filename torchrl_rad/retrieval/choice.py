@@ -15,6 +15,7 @@ __all__ = [
     "choose",
     "most_similar",
     "ordered",
+    "rounding",
     "similarity",
     "square_distance",
 ]
@@ -32,7 +33,8 @@ class Candidates(NamedTuple):
     Attributes:
         score: float64 [Q, C], falling; C >= k. No other row has a larger one than the last.
         row: int64 [Q, C], which they are.
-        error: float64 [Q], how wrong a score can be.
+        error: float64 [Q], how wrong a score can be, and how different those of rows can be besides
+            that are equally similar, for similarities are rounded.
         base: float64 [Q].
     """
 
@@ -114,10 +116,7 @@ def ordered(
     near, index = near[:, :k], index[:, :k]
     if found.row.shape[1] == len(rows):
         return near, index, torch.full_like(found.base, torch.inf)
-    fine = 2 * (rows.shape[-1] + 4) * torch.finfo(torch.float64).eps  # similarities are rounded too
-    square = square_distance(near[:, -1], metric)
-    square = square + fine * ((1 + square) if metric == "cosine" else (1 + square.sqrt()).square())
-    return near, index, found.base - square / 2 - found.error
+    return near, index, found.base - square_distance(near[:, -1], metric) / 2 - found.error
 
 
 def most_similar(near: Tensor, index: Tensor) -> tuple[Tensor, Tensor]:
@@ -130,6 +129,15 @@ def most_similar(near: Tensor, index: Tensor) -> tuple[Tensor, Tensor]:
         again, ranked = near[tied].gather(-1, order).sort(dim=-1, descending=True, stable=True)
         near[tied], index[tied] = again, places.gather(-1, ranked)
     return near, index
+
+
+def rounding(found: Candidates, metric: Metric, dims: int) -> Tensor:
+    """How different the scores of rows can be that are equally similar, [Q]."""
+    fine = 2 * (dims + 4) * torch.finfo(torch.float64).eps
+    if metric == "cosine":
+        return torch.full_like(found.base, 4 * fine)
+    farthest = (2 * (found.base - found.score[:, -1])).clamp_min(0.0).sqrt()
+    return fine * (1 + farthest).square()
 
 
 def choose(

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torchrl_rad.retrieval.choice import Candidates, ordered
+from torchrl_rad.retrieval.choice import Candidates, ordered, rounding
 from torchrl_rad.retrieval.search import ScanIndex
 
 __all__ = ["ListIndex"]
@@ -158,4 +158,5 @@ class ListIndex:
         score, moved, error = self._scores(lists, point, max(kept, int(count.amax())))
         score, place = score.topk(kept, dim=-1)
         row = lists.row.gather(-1, place)
-        return Candidates(score.double(), row, error, moved.square() / 2)
+        found = Candidates(score.double(), row, error, moved.square() / 2)
+        return found._replace(error=error + rounding(found, self.metric, point.shape[-1]))

@@ -7,7 +7,14 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from torchrl_rad.retrieval.choice import Candidates, Metric, most_similar, ordered, similarity
+from torchrl_rad.retrieval.choice import (
+    Candidates,
+    Metric,
+    most_similar,
+    ordered,
+    rounding,
+    similarity,
+)
 
 __all__ = ["ScanIndex", "TreeIndex"]
 
@@ -68,7 +75,8 @@ class ScanIndex:
         score, index = self.best(query, self.kept(k))
         square = query.square().sum(-1)
         base = square / 2 if self.metric == "euclidean" else torch.ones_like(square)
-        return Candidates(score.double(), index, self.error(query), base)
+        found = Candidates(score.double(), index, self.error(query), base)
+        return found._replace(error=found.error + rounding(found, self.metric, query.shape[-1]))
 
     def kept(self, k: int) -> int:
         """How many candidates there are for k neighbours."""
@@ -169,9 +177,10 @@ class TreeIndex:
         query, wanted = query.double(), min(k + 1, len(self.rows))
         distance, row = self.tree.query(query.numpy(), k=wanted)
         score = torch.from_numpy(distance).view(len(query), wanted).square().mul_(-0.5)
-        error = 1e-12 * (1 + query.square().sum(-1) - score[:, -1])
-        row = torch.from_numpy(row).view(len(query), wanted)
-        return Candidates(score, row, error, torch.zeros_like(error))
+        row, zero = torch.from_numpy(row).view(len(query), wanted), torch.zeros(len(query))
+        found = Candidates(score, row, zero.double(), zero.double())
+        # the tree sums squares in another order
+        return found._replace(error=2 * rounding(found, self.metric, query.shape[-1]))
 
     def _around(self, query: Tensor, radius: np.ndarray, k: int) -> tuple[Tensor, Tensor]:
         """All rows within the radius, ordered: exact among ties."""
