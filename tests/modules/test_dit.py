@@ -152,3 +152,13 @@ def test_state_dict_round_trip():
 def test_bad_width(width, heads):
     with pytest.raises(ValueError, match=rf"width is {width}; expected an even multiple of heads"):
         DiT(state_dim=3, tokens=5, width=width, heads=heads)
+
+
+@pytest.mark.parametrize("free", [slice(0, 5), slice(1, 5), slice(1, 4), slice(2, 3)])
+def test_only_the_tokens_asked_for(free):
+    network = DiT(3, 5, width=32, heads=4)
+    with torch.no_grad():
+        for parameter in network.parameters():
+            parameter.normal_(0.0, 0.2)
+    x, mask, time = torch.randn(4, 5, 3), torch.rand(4, 5, 1) < 0.5, torch.rand(4)
+    torch.testing.assert_close(network(x, mask, time, free), network(x, mask, time)[:, free])

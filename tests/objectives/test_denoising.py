@@ -44,15 +44,15 @@ def run(loss, td, seed=0):
 
 
 class Stub(torch.nn.Module):
-    """In place of the networks: predicts ``value`` everywhere and keeps its inputs."""
+    """In place of the networks: predicts ``value`` where it is asked and keeps its inputs."""
 
     def __init__(self, value):
         super().__init__()
         self.value, self.calls = value, []
 
-    def forward(self, level, sample, mask, time):
+    def forward(self, level, sample, mask, time, free):
         self.calls.append((level, sample, mask, time))
-        return torch.full_like(sample, self.value)
+        return torch.full_like(sample[:, free], self.value)
 
 
 def stubbed(value=0.0, **kwargs):
@@ -97,11 +97,14 @@ def test_known_entries_do_not_enter_the_loss_nor_its_gradient():
     loss = make(no_target=0.0, reduction="none")
     seen = []
 
-    def spy(module, args, out):
+    def spy(module, args, kwargs, out):
         out.retain_grad()
-        seen.append((args[2], out))
+        asked = torch.zeros_like(args[2])
+        asked[:, kwargs["free"]] = True
+        assert (args[2] | asked).all()  # no unknown entry is left out
+        seen.append((args[2][:, kwargs["free"]], out))
 
-    loss.network.register_forward_hook(spy)
+    loss.network.register_forward_hook(spy, with_kwargs=True)
     run(loss, windows(30))["loss_denoising"].sum().backward()
     assert len(seen) == 2
     for mask, out in seen:

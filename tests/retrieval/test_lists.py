@@ -91,14 +91,15 @@ def test_a_row_just_outside_the_list(small_lists, metric):
 def test_searches_are_counted(small_lists):
     rows = torch.arange(100.0)[:, None]
     index = ListIndex(ScanIndex(rows, "euclidean"))
-    index.search(torch.tensor([[50.0]]), 3)
+    for state in (50.0, 52.0, 55.0, 58.0, 60.0):
+        index.search(torch.tensor([[state]]), 3)
     assert index.searches == 1  # 50 rows, 25 on either side
-    index.search(torch.tensor([[60.0]]), 3)
-    assert index.searches == 1
     index.search(torch.tensor([[80.0]]), 3)
+    assert index.searches == 2 and index.pause == 0
+    index.search(torch.tensor([[84.0]]), 3)
     assert index.searches == 2
-    index.search(torch.tensor([[90.0]]), 3)
-    assert index.searches == 2
+    index.search(torch.tensor([[40.0]]), 3)
+    assert index.searches == 3 and index.pause == 1  # that list lasted for two searches only
 
 
 def test_useless_lists_are_not_made_for_some_time(small_lists):

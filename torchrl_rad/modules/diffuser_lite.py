@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import torch
 from tensordict import TensorDictBase
@@ -43,8 +43,8 @@ class Pin(NamedTuple):
 class PlanNetworks(nn.ModuleList):
     """One network a level; called with the level's number."""
 
-    def forward(self, level: int, sample: Tensor, mask: Tensor, time: Tensor) -> Tensor:
-        return self[level](sample, mask, time)
+    def forward(self, level: int, *args: Any, **kwargs: Any) -> Tensor:
+        return self[level](*args, **kwargs)
 
     def reset_parameters_recursive(self) -> None:
         """Draws new weights, as a TensorDictModule does."""
@@ -264,7 +264,7 @@ class DiffuserLitePlanner(TensorDictModuleBase):
         copies = self.candidates if number == 0 else 1
         many, many_mask = known.repeat_interleave(copies, 0), mask.repeat_interleave(copies, 0)
         given = network.prepare(many_mask)
-        free = slice(1, tokens if end is None else tokens - 1)  # the others are known in all rows
+        free = self.levels[number].free(number)
         sample = sample_plan(
             self.process,
             lambda x, step: network(x, given, step, free),

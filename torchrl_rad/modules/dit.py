@@ -18,13 +18,14 @@ def sinusoids(positions: Tensor, size: int) -> Tensor:
     return torch.cat([angles.sin(), angles.cos()], -1)
 
 
-def attend(qkv: Tensor) -> Tensor:
-    """Attention over queries, keys and values in one, [3, B, heads, L, E]: [B, heads, L, E]."""
-    if qkv.dtype != torch.bfloat16 or not qkv.is_cpu:
-        return F.scaled_dot_product_attention(*qkv)
+def attend(query: Tensor, key: Tensor, value: Tensor) -> Tensor:
+    """Attention [B, heads, f, E] of queries [B, heads, f, E] to the keys [B, heads, n, E]."""
+    if query.dtype != torch.bfloat16 or not query.is_cpu:
+        return F.scaled_dot_product_attention(query, key, value)
     # with so few tokens the CPU's fused kernel is slower in bfloat16 than in float32
     with torch.autocast("cpu", enabled=False):
-        return F.scaled_dot_product_attention(*qkv.float()).to(qkv.dtype)
+        parts = query.float(), key.float(), value.float()
+        return F.scaled_dot_product_attention(*parts).to(query.dtype)
 
 
 class Block(nn.Module):
@@ -36,20 +37,26 @@ class Block(nn.Module):
         self.norm = nn.LayerNorm(width, eps=1e-6, elementwise_affine=False)
         self.qkv = nn.Linear(width, 3 * width)
         self.out = nn.Linear(width, width)
+        # the exact form: on a CPU the one with tanh takes four times as long
         self.mlp = nn.Sequential(
-            nn.Linear(width, 4 * width), nn.GELU("tanh"), nn.Linear(4 * width, width)
+            nn.Linear(width, 4 * width), nn.GELU(), nn.Linear(4 * width, width)
         )
         self.modulation = nn.Linear(width, 6 * width)
 
-    def forward(self, x: Tensor, condition: Tensor) -> Tensor:
+    def forward(self, x: Tensor, condition: Tensor, free: slice | None = None) -> Tensor:
+        """[B, n, W] to [B, f, W], the tokens in ``free`` or all; ``condition`` is [B or 1, W]."""
         parts = self.modulation(condition)[:, None].chunk(6, -1)  # each [B or 1, 1, W]
         shift, scale, gate, shift_mlp, scale_mlp, gate_mlp = parts
-        x = x + gate * self._attention(self.norm(x) * (1 + scale) + shift)
-        return x + gate_mlp * self.mlp(self.norm(x) * (1 + scale_mlp) + shift_mlp)
+        h = self._attention(torch.addcmul(shift, self.norm(x), 1 + scale), free)
+        x = torch.addcmul(x if free is None else x[:, free], gate, h)
+        return torch.addcmul(
+            x, gate_mlp, self.mlp(torch.addcmul(shift_mlp, self.norm(x), 1 + scale_mlp))
+        )
 
-    def _attention(self, x: Tensor) -> Tensor:
-        qkv = self.qkv(x).unflatten(-1, (3, self.heads, -1))
-        mixed = attend(qkv.permute(2, 0, 3, 1, 4))  # [B, heads, L, W / heads]
+    def _attention(self, x: Tensor, free: slice | None) -> Tensor:
+        qkv = self.qkv(x).unflatten(-1, (3, self.heads, -1)).transpose(1, 3)
+        query, key, value = qkv.unbind(2)  # each [B, heads, n, W / heads]
+        mixed = attend(query if free is None else query[:, :, free], key, value)
         return self.out(mixed.transpose(1, 2).flatten(-2))
 
 
@@ -115,20 +122,23 @@ class DiT(nn.Module):
             if name.endswith(("modulation.weight", "head.weight")):
                 nn.init.zeros_(parameter)
 
-    def forward(self, x: Tensor, mask: Tensor, time: Tensor) -> Tensor:
-        """Predicts [B, n, S].
+    def forward(self, x: Tensor, mask: Tensor, time: Tensor, free: slice | None = None) -> Tensor:
+        """Predicts [B, f, S].
 
         Args:
             x (Tensor): noisy states [B, n, S].
             mask (Tensor): bool [B, n, 1], True where they are known.
             time (Tensor): of the process, [B], or [1] for all alike.
+            free (slice, optional): the f tokens asked for. Defaults to all.
         """
         if self.mask_channel:
             x = torch.cat([x, mask.to(x.dtype)], -1)
-        x = self.embed(x) + self.positions  # [B, n, W]
+        x = self.embed(x)
+        x = x + self.positions.to(x.dtype)  # [B, n, W], of the precision of autocast
         codes = sinusoids(1000.0 * time, self.width)
         condition = self.time(codes.to(self.positions.dtype))  # [B or 1, W]
-        for block in self.blocks:
+        for block in self.blocks[:-1]:
             x = block(x, condition)
+        x = self.blocks[-1](x, condition, free)
         shift, scale = self.modulation(condition)[:, None].chunk(2, -1)
-        return self.head(self.norm(x) * (1 + scale) + shift)
+        return self.head(torch.addcmul(shift, self.norm(x), 1 + scale))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Iterable, Sequence
-from operator import is_
 from typing import Any, Protocol, cast
 
 import torch
@@ -109,13 +108,13 @@ class FrozenLinear:
             self.weight = weight.T.contiguous() if weight.is_cpu else weight.T
 
     def __call__(self, x: Tensor, gelu: bool = False) -> Tensor:
-        """[M, out] of rows [M, in], through the tanh form of GELU if asked for."""
+        """[M, out] of rows [M, in], through GELU if asked for."""
         x = x.to(self.dtype)
         if self.product is not None:
-            name, form = ("gelu", "tanh") if gelu else ("none", "")
+            name, form = ("gelu", "none") if gelu else ("none", "")
             return self.product(x, self.weight, self.bias, name, [], form)
         x = torch.addmm(self.bias, x, self.weight)
-        return F.gelu(x, approximate="tanh") if gelu else x
+        return F.gelu(x) if gelu else x
 
 
 def _packed_product() -> Callable[..., Tensor] | None:
@@ -229,8 +228,9 @@ class FrozenCache:
     """
 
     def __init__(self) -> None:
-        self.parameters: list[nn.Parameter] = []
-        self.state: list[tuple[int, int]] = []
+        self.modules: list[nn.Module] = []
+        self.places: list[tuple[nn.Module, str]] = []
+        self.state: list[tuple[int, int, int]] = []
         self.samples: list[Tensor] = []
         self.before = torch.empty(0)
         self.made: dict[Hashable, Any] = {}
@@ -241,11 +241,15 @@ class FrozenCache:
     @torch.no_grad()
     def get(self, module: nn.Module, key: Hashable, make: Callable[[], Any]) -> Any:
         """What ``make()`` gave for ``key`` at the module's present weights."""
-        parameters = list(module.parameters())
-        state = [(p.data_ptr(), p._version) for p in parameters]
-        same = state == self.state and all(map(is_, parameters, self.parameters))
+        modules = list(module.modules())
+        if modules != self.modules:
+            self.modules = modules
+            self.places = [(m, name) for m in modules for name in m._parameters]
+        parameters = [p for m, name in self.places if (p := getattr(m, name)) is not None]
+        state = [(id(p), p.data_ptr(), p._version) for p in parameters]
+        same = state == self.state
         if not same:
-            self.parameters, self.state = parameters, state
+            self.state = state
             self.samples = [p.detach().flatten() if p.ndim < 2 else p[0] for p in parameters]
         sample = torch.cat(self.samples)
         if not same or not torch.equal(sample, self.before):

@@ -23,6 +23,10 @@ class Level(NamedTuple):
         """Steps from the first state to the last one."""
         return self.jump * (self.tokens - 1)
 
+    def free(self, number: int) -> slice:
+        """Tokens that are to be planned: not the first, nor on finer levels the last."""
+        return slice(1, self.tokens if number == 0 else self.tokens - 1)
+
 
 def plan_levels(horizon: int, jumps: Sequence[int]) -> list[Level]:
     """The levels of a plan of ``horizon`` states: each one refines the first jump of the one above.

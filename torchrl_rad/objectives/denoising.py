@@ -136,12 +136,12 @@ class DenoisingLoss(KeyedLoss):
         time = torch.rand(len(clean), device=clean.device)
         noise = torch.randn_like(clean)
         noisy = torch.where(mask, clean, self.process.corrupt(clean, noise, time[:, None, None]))
-        predicted = self.network(number, noisy, mask, time).to(clean.dtype)
-        error = predicted - self.process.target(clean, noise)
-        weight = torch.ones(clean.shape[1], device=clean.device)
-        weight[1] = self.next_weight
-        error = torch.where(mask, 0.0, error.square()) * weight[:, None]
-        return error.mean((-2, -1))
+        free = self.levels[number].free(number)  # the others count for nothing
+        predicted = self.network(number, noisy, mask, time, free=free).to(clean.dtype)
+        error = predicted - self.process.target(clean, noise)[:, free]
+        error = error.square().masked_fill(mask[:, free], 0.0)
+        total = error.sum((-2, -1)) + (self.next_weight - 1) * error[:, 0].sum(-1)
+        return total / clean[0].numel()
 
     def pieces(self, number: int, windows: Tensor) -> tuple[Tensor, Tensor]:
         """A random piece of each window on one level's grid, with the pseudo target in it.

@@ -109,8 +109,8 @@ class ListIndex:
         return self.scan.candidates(query, k)
 
     def _renewed(self, lists: Lists, fails: Tensor, query: Tensor, point: Tensor) -> Lists:
-        # lists that did not even last for one search are not worth making for some time
-        useful = bool((lists.served[fails] > 1).any())
+        # to make a list costs about two searches: those that last for less are not worth it
+        useful = bool(lists.served[fails].double().mean() > 4)
         self.pause, self.waited = 0 if useful else min(2 * self.pause + 1, LONGEST_PAUSE), 0
         made = self._made(query[fails], point[fails], lists.row.shape[1])
         return Lists(*(o.index_put((fails,), n) for o, n in zip(lists, made, strict=True)))
