@@ -1,25 +1,38 @@
-"""Neighbours and targets for states along recorded trajectories; filling and opening a database."""
+"""Neighbours and targets for states along recorded trajectories, against a plain scan of all rows.
+
+Percentiles are of consecutive calls, each with the next state of a trajectory.
+"""
 
 from __future__ import annotations
 
 import argparse
 import gc
+from importlib.metadata import version
 from itertools import cycle
+from time import perf_counter
 
+import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict
 from torchrl.data import LazyTensorStorage
 
-from torchrl_rad import ExpertDatabase, RetrievalSampler, RetrievalTargetModule, ScanIndex
+from torchrl_rad import (
+    ExpertDatabase,
+    RetrievalSampler,
+    RetrievalTargetModule,
+    pointmaze_dataset,
+)
 
 THREADS = 1
+VERSIONS = {name: version(name) for name in ("torch", "torchrl", "tensordict", "torchrl_rad")}
 DEVICE = torch.device("cuda:0" if torch.cuda.is_available() else "cpu")
 EPISODE = 500  # steps
 BOX = 6.0  # side of the space walked in
 STEP = 0.05  # of a walk, in each dim
-ASIDE = 0.1  # distance of a query from the recorded state
-DRIVEN = 64  # consecutive states asked for
+ASIDE = 0.1  # distance of a driven trajectory from the recorded one
+DRIVEN = 200  # consecutive states asked for
+SECONDS = 3.0  # for the calls of one case; 10 at least
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -32,7 +45,7 @@ def fixed_threads():
 
 @pytest.fixture(autouse=True)
 def stated(benchmark):
-    benchmark.extra_info.update(threads=THREADS, device=str(DEVICE))
+    benchmark.extra_info.update(threads=THREADS, device=str(DEVICE), versions=VERSIONS)
 
 
 def walks(rows: int, dims: int) -> torch.Tensor:
@@ -53,9 +66,12 @@ def recorded(rows: int, dims: int) -> TensorDict:
     return TensorDict({"observation": state, "next": {"reward": reward, "done": done}}, [rows])
 
 
-def empty_database(rows: int) -> ExpertDatabase:
-    sampler = RetrievalSampler("euclidean", threshold=0.8, backend="auto")
-    return ExpertDatabase(LazyTensorStorage(rows, device=DEVICE), gamma=0.97, sampler=sampler)
+def filled(steps: TensorDict, dims: list[int] | None = None) -> ExpertDatabase:
+    sampler = RetrievalSampler("euclidean", dims, threshold=0.8, backend="auto")
+    storage = LazyTensorStorage(len(steps), device=DEVICE)
+    database = ExpertDatabase(storage, gamma=0.97, sampler=sampler)
+    database.extend(steps)
+    return database
 
 
 @pytest.fixture(scope="module", params=[10_000, 100_000, 1_000_000], ids=["10k", "100k", "1M"])
@@ -63,7 +79,7 @@ def rows(request):
     return request.param
 
 
-@pytest.fixture(scope="module", params=[2, 17, 29], ids="{}d".format)
+@pytest.fixture(scope="module", params=[2, 17, 29, 60], ids="{}d".format)
 def dims(request):
     return request.param
 
@@ -71,21 +87,19 @@ def dims(request):
 @pytest.fixture(scope="module")
 def database(rows, dims):
     """One at a time: the next one is made when no test needs this one any more."""
-    database = empty_database(rows)
-    database.extend(recorded(rows, dims))
-    yield database
+    yield filled(recorded(rows, dims))
     gc.collect()  # a buffer and its storage refer to each other
 
 
-def driven(database: ExpertDatabase, queries: int) -> cycle:
-    """Endless consecutive states [queries, S], each beside a recorded episode."""
+def beside(database: ExpertDatabase, queries: int) -> torch.Tensor:
+    """Consecutive states [DRIVEN, queries, S], each trajectory a little aside of a recorded one."""
     generator = torch.Generator().manual_seed(1)
-    last = len(database) - DRIVEN
-    begin = torch.linspace(0, last, queries).long() // EPISODE * EPISODE
+    begin = torch.linspace(0, len(database) - DRIVEN, queries).long()
+    begin = begin - (begin % EPISODE - (EPISODE - DRIVEN)).clamp_min(0)  # within an episode
     index = begin + torch.arange(DRIVEN)[:, None]
-    aside = torch.randn(*index.shape, database.width, generator=generator)
+    aside = torch.randn(queries, database.width, generator=generator)
     aside = ASIDE * torch.nn.functional.normalize(aside, dim=-1)
-    return cycle((database[:]["observation"][index.to(DEVICE)] + aside.to(DEVICE)).unbind(0))
+    return database[:]["observation"][index.to(DEVICE)] + aside.to(DEVICE)
 
 
 def finished(result):
@@ -95,77 +109,121 @@ def finished(result):
     return result
 
 
-def run(benchmark, call, database: ExpertDatabase, queries: int):
-    """Many rounds of a quick call, one of the slowest; gives the result of the last one."""
-    index = database.sampler.build(database.storage)
-    benchmark.extra_info["index"] = type(index).__name__
-    # a tree looks at few rows, a scan at all of them
-    entries = len(database) * database.width * queries if isinstance(index, ScanIndex) else 0
-    rounds = max(1, min(50, 100_000_000 // max(1, entries)))
-    return benchmark.pedantic(lambda: finished(call()), rounds=rounds, warmup_rounds=rounds // 10)
+def spent(call) -> float:
+    """Milliseconds."""
+    begin = perf_counter()
+    finished(call())
+    return 1e3 * (perf_counter() - begin)
 
 
-sizes = [
+def run(benchmark, call):
+    """DRIVEN rounds of a quick call, fewer of a slow one; gives the result of the last one.
+
+    The percentiles go into extra_info; the number of rounds is pytest-benchmark's.
+    """
+    call()  # what is made at the first call
+    fits = int(1e3 * SECONDS / spent(call))
+    rounds = max(10, min(DRIVEN, fits)) if benchmark.enabled else 1
+    times = []
+
+    def timed():
+        begin = perf_counter()
+        result = finished(call())
+        times.append(1e3 * (perf_counter() - begin))
+        return result
+
+    result = benchmark.pedantic(timed, rounds=rounds)
+    p50, p95 = np.percentile(times, [50, 95])
+    benchmark.extra_info.update(p50_ms=float(p50), p95_ms=float(p95))
+    return result
+
+
+def scan(benchmark, rows: torch.Tensor, states: torch.Tensor, k: int) -> None:
+    """Times what a search has to beat: a product with all rows and the k best, in float32."""
+    offset = -rows.square().sum(-1) / 2  # from the product to the order of distances
+
+    def plain(query):
+        return torch.addmm(offset, query, rows.T).topk(min(k, len(rows)))
+
+    times = [spent(lambda query=query: plain(query)) for query in states[:8]]
+    plain_ms = float(np.median(times[1:]))
+    ratio = plain_ms / benchmark.extra_info["p50_ms"]
+    benchmark.extra_info.update(plain_scan_ms=plain_ms, ratio=ratio)
+
+
+def cases(*marks):
+    """Marks a test with all of them."""
+
+    def mark(function):
+        for one in (*marks, pytest.mark.timeout(1200)):  # the longest: 1M rows, 50 queries
+            function = one(function)
+        return function
+
+    return mark
+
+
+sizes = cases(
     pytest.mark.parametrize("k", [6, 500], ids="k{}".format),
     pytest.mark.parametrize("queries", [1, 50], ids="q{}".format),
-    pytest.mark.timeout(1200),  # the longest scan: 1M rows, 29 dims, 50 queries
-]
+)
+rules = pytest.mark.parametrize("rule", ["highest", "followed"])
 
 
-def with_sizes(function):
-    for mark in sizes:
-        function = mark(function)
-    return function
-
-
-@with_sizes
+@sizes
 def test_rad_search_speed(benchmark, database, k, queries):
     sampler, storage = database.sampler, database.storage
     sampler.k = k
-    states = driven(database, queries)
-    _, info = run(benchmark, lambda: sampler.search(storage, next(states)), database, queries)
-    benchmark.extra_info["neighbours"] = float(info["valid"].sum(-1).float().mean())
+    states = beside(database, queries)
+    endless = cycle(states)
+    _, info = run(benchmark, lambda: sampler.search(storage, next(endless)))
+    scan(benchmark, database[:]["observation"], states, k)
+    index = type(sampler.build(storage)).__name__
+    neighbours = float(info["valid"].sum(-1).float().mean())
+    benchmark.extra_info.update(index=index, neighbours=neighbours)
 
 
-@with_sizes
-@pytest.mark.parametrize("rule", ["highest", "followed"])
-def test_rad_target_speed(benchmark, database, k, queries, rule):
+def measure_target(benchmark, database, states, k, rule):
+    """The whole target rule, asked for states [DRIVEN, Q, S] one after the other."""
     database.sampler.k = k
-    states = driven(database, queries)
     select = RetrievalTargetModule(database, horizon=129, rule=rule, ahead=16)
-    select(TensorDict({"observation": next(states)[:1]}, [1]))  # makes the columns of the rule
+    endless = cycle(states)
 
     def target():
-        return select(TensorDict({"observation": next(states)}, [queries]))
+        return select(TensorDict({"observation": next(endless)}, [states.shape[1]]))
 
-    found = run(benchmark, target, database, queries)["found"]
+    found = run(benchmark, target)["found"]
+    dims = database.sampler.dims or range(database.width)
+    rows, queries = (x[..., list(dims)] for x in (database[:]["observation"], states))
+    scan(benchmark, rows.contiguous(), queries, k)
     assert found.all()  # without neighbours there is little to do
 
 
-def test_rad_database_extend_speed(benchmark, rows, dims):
-    steps = recorded(rows, dims)
-
-    def fresh():
-        gc.collect()  # that of the round before
-        return (empty_database(rows), steps), {}
-
-    benchmark.pedantic(lambda d, s: finished(d.extend(s)), setup=fresh, rounds=3)
-    benchmark.extra_info["megabytes"] = round(steps.bytes() / 1e6, 1)
+@sizes
+@rules
+def test_rad_target_speed(benchmark, database, k, queries, rule):
+    measure_target(benchmark, database, beside(database, queries), k, rule)
 
 
-def test_rad_index_build_speed(benchmark, database):
-    def forget():
-        database.sampler.invalidate()
-        return (database.storage,), {}
+@pytest.fixture(scope="module")
+def replanned():
+    """Episodes of PointMaze: a database of the first 80, and the states of 20 others."""
+    steps = pointmaze_dataset("umaze", steps=30_000, progress=False).to(DEVICE)
+    held, episodes = 24_000, 20
+    others = steps["observation"][held:].unflatten(0, (episodes, -1))
+    return filled(steps[:held], dims=[0, 1]), others
 
-    build = database.sampler.build
-    benchmark.pedantic(lambda storage: finished(build(storage)), setup=forget, rounds=3)
 
-
-@pytest.mark.parametrize("memmap", [False, True], ids=["copied", "memmap"])
-def test_rad_database_load_speed(benchmark, database, memmap, tmp_path):
-    database.dumps(tmp_path / "database")
-    benchmark.pedantic(ExpertDatabase.loads, (tmp_path / "database",), {"memmap": memmap}, rounds=3)
+@sizes
+@rules
+def test_rad_replan_speed(benchmark, replanned, k, queries, rule):
+    """Along episodes that MuJoCo recorded and the database does not hold, searched by position."""
+    database, others = replanned
+    number = torch.arange(queries)
+    begin = number // len(others) * 40  # more queries than episodes: others start later
+    index = begin + torch.arange(DRIVEN)[:, None]
+    states = others[number % len(others), index]
+    benchmark.extra_info["rows"] = len(database)
+    measure_target(benchmark, database, states, k, rule)
 
 
 if __name__ == "__main__":

@@ -11,7 +11,7 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 FILES = sorted((ROOT / "benchmarks").glob("test_*.py"))
-LARGER = "100k 1M 17d 29d k500 q50 c16 b50 b128 h129 bf16".split()
+LARGER = "100k 1M 17d 29d 60d k500 q50 c16 b50 b128 h129 bf16".split()
 
 
 def functions(tree):
