@@ -1,24 +1,46 @@
-"""One plan, and one action of the whole policy TS -> SE -> PL, at PointMaze's sizes."""
+"""One plan, against a plain one, and one action of the whole policy TS -> SE -> PL."""
 
 from __future__ import annotations
 
 import argparse
-from itertools import cycle
+import inspect
+from importlib.metadata import version
+from itertools import cycle, pairwise, product
+from time import perf_counter
+from typing import NamedTuple
 
+import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict
 from torchrl.data import LazyTensorStorage
 from torchrl.modules import DiffusionActor
 
-from torchrl_rad import ExpertDatabase, RetrievalSampler
-from torchrl_rad.evaluation import measure_latency
+from torchrl_rad import DiffuserLitePlanner, ExpertDatabase, RetrievalSampler
 from torchrl_rad.policy import build_policy, fit_scales
+from torchrl_rad.training import uses_bf16
 
 THREADS = 1
+VERSIONS = {name: version(name) for name in ("torch", "torchrl", "tensordict", "torchrl_rad")}
 DEVICE = torch.device("cuda:0" if torch.cuda.is_available() else "cpu")
 EPISODES, LENGTH = 200, 300  # 60,000 rows
 DRIVEN = 32  # consecutive states asked for
+SECONDS = 3.0  # for the calls of one case; 5 at least, 50 at most
+
+
+class Size(NamedTuple):
+    state: int
+    action: int
+    width: int
+    heads: int
+    steps: int  # calls of the network a level
+
+
+SIZES = {
+    "pointmaze": Size(4, 2, 256, 8, 3),
+    "hopper": Size(11, 3, 256, 8, 3),
+    "antmaze": Size(29, 8, 320, 10, 5),
+}
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -31,17 +53,16 @@ def fixed_threads():
 
 @pytest.fixture(autouse=True)
 def stated(benchmark):
-    benchmark.extra_info.update(threads=THREADS, device=str(DEVICE))
+    benchmark.extra_info.update(threads=THREADS, device=str(DEVICE), versions=VERSIONS)
 
 
-@pytest.fixture(scope="module")
-def database():
-    """Random walks in a plane: states [N, 4] of position and velocity, actions [N, 2]."""
+def make_database(size: str) -> ExpertDatabase:
+    """Random walks: states [N, S], searched by position, the first two entries."""
     generator = torch.Generator().manual_seed(0)
-    shape = (EPISODES, LENGTH, 2)
-    velocity = 0.05 * torch.randn(shape, generator=generator)
-    start = 6 * torch.rand(EPISODES, 1, 2, generator=generator)
-    state = torch.cat([start + velocity.cumsum(1), velocity], -1).flatten(0, 1).to(DEVICE)
+    width, actions = SIZES[size][:2]
+    change = 0.05 * torch.randn(EPISODES, LENGTH, width, generator=generator)
+    start = 6 * torch.rand(EPISODES, 1, width, generator=generator)
+    state = (start + change.cumsum(1)).flatten(0, 1).to(DEVICE)
     done = torch.zeros(len(state), 1, dtype=torch.bool, device=DEVICE)
     done[LENGTH - 1 :: LENGTH] = True
     following = {
@@ -49,97 +70,244 @@ def database():
         "reward": (state[:, :2].norm(dim=-1, keepdim=True) < 2.0).float(),
         "done": done,
     }
-    steps = {"observation": state, "action": state[:, 2:].clamp(-1, 1), "next": following}
+    action = torch.zeros(len(state), actions, device=DEVICE)
+    steps = {"observation": state, "action": action, "next": following}
     sampler = RetrievalSampler("euclidean", dims=[0, 1], k=500, threshold=0.8)
     database = ExpertDatabase(LazyTensorStorage(len(state), device=DEVICE), 0.97, sampler=sampler)
     database.extend(TensorDict(steps, [len(state)]))
     return database
 
 
-def make_policy(database: ExpertDatabase, rule: str = "followed", **planner):
-    """The policy of the recipe, with fresh weights: they do not change what a plan costs."""
+@pytest.fixture(scope="module")
+def databases():
+    return {size: make_database(size) for size in SIZES}
+
+
+def asked_precision(precision: str) -> dict[str, str]:
+    """The planner's keyword, or a skip where this machine or version has nothing to gain."""
+    if precision == "bf16" and not uses_bf16("auto", DEVICE):
+        pytest.skip("products of bfloat16 matrices are not faster on this device")
+    if "precision" in inspect.signature(DiffuserLitePlanner.__init__).parameters:
+        return {"precision": precision}
+    if precision == "bf16":
+        pytest.skip("this version of the planner has float32 only")
+    return {}
+
+
+def make_policy(database, size, rule="highest", precision="fp32", target=True, **planner):
+    """A policy as the recipe's, with random weights: they do not change what a plan costs."""
     torch.manual_seed(0)
-    description = {
-        "state_dim": 4,
-        "action_dim": 2,
-        "planner": planner,
-        "target": {"rule": rule},
-        "estimator": {"estimate": "recorded" if rule == "followed" else "mode"},
-    }
-    policy = build_policy(description, database)
+    state, action, width, heads, steps = SIZES[size]
+    planner.update(width=width, heads=heads, steps=steps, **asked_precision(precision))
+    description = {"state_dim": state, "action_dim": action, "planner": planner, "target": None}
+    if target:
+        description["target"] = {"rule": rule}
+        description["estimator"] = {"estimate": "recorded" if rule == "followed" else "mode"}
+    policy = build_policy(description, database if target else None)
     fit_scales(policy, database[:])
+    with torch.no_grad():  # fresh ones give zero, whatever the network does
+        for parameter in policy[-1].networks.parameters():
+            parameter.add_(0.02 * torch.randn_like(parameter))
     return policy.to(DEVICE).eval()
 
 
 def driven(database: ExpertDatabase, batch: int) -> torch.Tensor:
-    """Consecutive states [batch, DRIVEN, S], each row along an episode of its own."""
+    """Consecutive states [batch, DRIVEN, S], each row beside an episode of its own."""
     states = database[:]["observation"].unflatten(0, (EPISODES, LENGTH))
     return states[:batch, 100 : 100 + DRIVEN] + 0.01
 
 
-def run(benchmark, module, tensordict_of, batch: int):
-    @torch.no_grad()
-    def act():
-        tensordict = module(tensordict_of())
-        if DEVICE.type == "cuda":  # a GPU works on while Python goes on
-            torch.cuda.synchronize(DEVICE)
-        return tensordict
-
-    rounds = 20 if batch == 1 else 5
-    return benchmark.pedantic(act, rounds=rounds, warmup_rounds=rounds // 5)
+# a plan
 
 
-batches = pytest.mark.parametrize("batch", [1, 50], ids="b{}".format)
+def plain_plan(planner, told, noise=torch.randn) -> dict[str, torch.Tensor]:
+    """The same plan, written down: each level's network, step by step, for every candidate."""
+    state, end, plan = told["observation"], None, None
+    for number in range(len(planner.levels)):
+        known, mask = known_states(planner, told, number, end)
+        copies = planner.candidates if number == 0 else 1
+        known, mask = known.repeat_interleave(copies, 0), mask.repeat_interleave(copies, 0)
+        clean = planner.normalizer(known)
+        sample = torch.where(mask, clean, noise(clean.shape, device=clean.device))
+        for time, following in pairwise(planner.process.grid(planner.steps)):
+            now = torch.full((1,), time, device=clean.device)
+            predicted = planner.networks[number](sample, mask, now)
+            moved = planner.process.step(sample, predicted, time, following)
+            sample = torch.where(mask, clean, moved)
+        states = torch.where(mask, known, planner.normalizer.inverse(sample))
+        states = states.unflatten(0, (len(state), copies))  # [Q, C, n, S]
+        best = planner.return_model(states).argmax(-1) if copies > 1 else state.new_zeros(1).long()
+        states = states[torch.arange(len(state), device=state.device), best]
+        plan = states if plan is None else torch.cat([states, plan[:, 2:]], 1)
+        end = states[:, 1]
+    return {"plan": plan, "action": planner.inverse_dynamics(state, plan[:, 1])}
 
 
-@batches
-@pytest.mark.parametrize("candidates", [1, 16], ids="c{}".format)
-@pytest.mark.parametrize("process", ["flow", "diffusion"])
-def test_rad_plan_speed(benchmark, database, process, candidates, batch):
-    """PL alone: 129 steps on three levels, three calls of the network each."""
-    select, estimate, planner = make_policy(database, process=process, candidates=candidates)
+def known_states(planner, told, number, end):
+    """What a level is told: states [Q, n, S] and their mask [Q, n, 1]."""
+    state, level = told["observation"], planner.levels[number]
+    known = state.new_zeros(len(state), level.tokens, state.shape[-1])
+    mask = torch.zeros(len(state), level.tokens, 1, dtype=torch.bool, device=state.device)
+    known[:, 0], mask[:, 0] = state, True
+    if end is not None:
+        known[:, -1], mask[:, -1] = end, True
+    step, row = told["target_step"].squeeze(-1), told["target_index"].squeeze(-1)
+    place, rows = planner.placement(step, number, *level), planner.database[:]
+    shift = (place.time - step).maximum(-rows["step"][row]).minimum(rows["remaining"][row])
+    here = torch.arange(level.tokens, device=state.device) == place.token[:, None]
+    here = (here & place.active[:, None])[..., None]
+    target = rows["observation"][row + shift]
+    return torch.where(here, target[:, None], known), mask | here
+
+
+def finished(result):
+    """A GPU works on while Python goes on."""
+    if DEVICE.type == "cuda":
+        torch.cuda.synchronize(DEVICE)
+    return result
+
+
+def spent(call) -> float:
+    """Milliseconds."""
+    begin = perf_counter()
+    finished(call())
+    return 1e3 * (perf_counter() - begin)
+
+
+def run(benchmark, call, between=lambda: None):
+    """As many rounds as fit, with another call before each, which does not count.
+
+    The machine is then as busy for the one as for the other. Gives the result of the last round.
+    """
+    call()  # what is made at the first call
+    fits = int(1e3 * SECONDS / (spent(call) + spent(between)))
+    rounds = max(5, min(50, fits)) if benchmark.enabled else 1
+    return benchmark.pedantic(lambda: finished(call()), setup=between, rounds=rounds)
+
+
+def assert_same_plan(planner, told):
+    before, planner.noise = planner.noise, "zero"
+    plain, plan = plain_plan(planner, told, torch.zeros)["plan"], planner(told.copy())["plan"]
+    planner.noise = before
+    torch.testing.assert_close(plan, plain, rtol=1e-3, atol=1e-3)
+
+
+@torch.no_grad()
+def measure_plan(benchmark, database, size, process, candidates, batch, precision):
+    """PL alone, told of targets, and the plain plan beside it."""
+    options = {"process": process, "candidates": candidates, "precision": precision}
+    select, estimate, planner = make_policy(database, size, **options)
     state = driven(database, batch)[:, 0]
     told = estimate(select(TensorDict({"observation": state}, [batch])))
     assert told["found"].all()
-    benchmark.extra_info["parameters"] = sum(p.numel() for p in planner.parameters())
-    planned = run(benchmark, planner, told.copy, batch)
+    parameters = sum(p.numel() for p in planner.parameters())
+    benchmark.extra_info.update(parameters=parameters, size=size)
+    if precision == "fp32":
+        assert_same_plan(planner, told)
+    times = []  # of the plain plan, always in float32
+
+    def plain():
+        times.append(spent(lambda: plain_plan(planner, told)))
+
+    planned = run(benchmark, lambda: planner(told.copy()), plain)
     assert planned["plan"].isfinite().all()
+    if benchmark.enabled:
+        plain_ms = float(np.median(times[1:]))
+        ratio = plain_ms / (1e3 * benchmark.stats["median"])
+        benchmark.extra_info.update(plain_ms=plain_ms, ratio=ratio)
 
 
-@batches
-@pytest.mark.parametrize("rule", ["highest", "followed"])
-def test_rad_policy_speed(benchmark, database, rule, batch):
-    """TS, SE and PL, four candidates; the median and 95 % times of each go into extra_info."""
-    policy = make_policy(database, rule, candidates=4)
-    states = driven(database, batch)
-    observations = cycle(states.unbind(1))
-    acted = run(
-        benchmark, policy, lambda: TensorDict({"observation": next(observations)}, [batch]), batch
-    )
+batches = pytest.mark.parametrize("batch", [1, 50], ids="b{}".format)
+processes = pytest.mark.parametrize("process", ["flow", "diffusion"])
+precisions = pytest.mark.parametrize("precision", ["fp32", "bf16"])
+# 50 environments with 64 candidates each take long at the larger sizes
+ASKED = [
+    pytest.param(size, candidates, batch, id=f"{size}-c{candidates}-b{batch}")
+    for size, candidates, batch in product(SIZES, [1, 64], [1, 50])
+    if size == "pointmaze" or candidates * batch < 3200
+]
+asked = pytest.mark.parametrize("size, candidates, batch", ASKED)
+
+
+@asked
+@processes
+@precisions
+def test_rad_plan_speed(benchmark, databases, size, candidates, batch, process, precision):
+    measure_plan(benchmark, databases[size], size, process, candidates, batch, precision)
+
+
+SCALING = [(1, 1), (1, 4), (1, 16), (1, 64), (4, 1), (16, 1), (64, 1)]
+
+
+@pytest.mark.parametrize(
+    "candidates, batch", [pytest.param(c, b, id=f"c{c}-b{b}") for c, b in SCALING]
+)
+@precisions
+def test_rad_plan_scaling_speed(benchmark, databases, candidates, batch, precision):
+    """The largest size against the number of environments, and of candidates."""
+    measure_plan(benchmark, databases["antmaze"], "antmaze", "flow", candidates, batch, precision)
+
+
+# a whole action
+
+
+def timed_action(policy, state) -> list[float]:
+    """Milliseconds of TS, SE, PL without inverse dynamics, and of that; then of all."""
+    told, inverse = TensorDict({"observation": state}, [len(state)]), policy[-1].inverse_dynamics
+    select, estimate, plan = (spent(lambda part=part: part(told)) for part in policy.module)
+    first = told["plan"][:, 1]
+    act = spent(lambda: inverse(state, first))  # by itself: the planner's time holds it too
+    return [select, estimate, plan - act, act, select + estimate + plan]
+
+
+def split_times(policy, states) -> dict[str, dict[str, float]]:
+    """Median and 95 % of each part of an action along states [B, T, S], the first two apart."""
+    times = np.array([timed_action(policy, state) for state in states.unbind(1)])[2:]
+    percentiles = np.percentile(times, [50, 95], axis=0).T.tolist()
+    names = ("TS", "SE", "PL", "ID", "total")
+    return {
+        name: {"p50": p50, "p95": p95} for name, (p50, p95) in zip(names, percentiles, strict=True)
+    }
+
+
+@asked
+@pytest.mark.parametrize(
+    "rule, process", [("highest", "flow"), ("highest", "diffusion"), ("followed", "flow")]
+)
+@precisions
+@torch.no_grad()
+def test_rad_policy_speed(benchmark, databases, size, candidates, batch, rule, process, precision):
+    """The times of TS, SE, PL and inverse dynamics go into extra_info."""
+    options = {"process": process, "candidates": candidates, "precision": precision}
+    policy = make_policy(databases[size], size, rule, **options)
+    states = driven(databases[size], batch)
+    endless = cycle(states.unbind(1))
+    acted = run(benchmark, lambda: policy(TensorDict({"observation": next(endless)}, [batch])))
     assert acted["action"].isfinite().all()
-    times = measure_latency(policy, states, batch, calls=10)
-    retrieval = sum(times[name]["p50"] for name in ("RetrievalTargetModule", "StepEstimator"))
-    share = retrieval / times["total"]["p50"]
-    benchmark.extra_info.update(milliseconds=times, share_of_ts_and_se=share)
+    calls = min(DRIVEN, 2 + benchmark.stats["rounds"]) if benchmark.enabled else 3
+    times = split_times(policy, states[:, :calls])
+    share = (times["TS"]["p50"] + times["SE"]["p50"]) / times["total"]["p50"]
+    benchmark.extra_info.update(size=size, milliseconds=times, share_of_ts_and_se=share)
 
 
 @batches
-def test_rad_backbone_speed(benchmark, database, batch):
-    """The same planner without a target."""
-    torch.manual_seed(0)
-    planner = {"candidates": 4}
-    policy = build_policy({"state_dim": 4, "action_dim": 2, "planner": planner}).to(DEVICE)
-    observations = cycle(driven(database, batch).unbind(1))
-    run(benchmark, policy, lambda: TensorDict({"observation": next(observations)}, [batch]), batch)
+@torch.no_grad()
+def test_rad_backbone_speed(benchmark, databases, batch):
+    """The same planner without a target, with four candidates."""
+    database = databases["pointmaze"]
+    policy = make_policy(database, "pointmaze", target=False, candidates=4)
+    endless = cycle(driven(database, batch).unbind(1))
+    run(benchmark, lambda: policy(TensorDict({"observation": next(endless)}, [batch])))
 
 
 @batches
-def test_rad_anchor_diffusion_actor_speed(benchmark, database, batch):
+@torch.no_grad()
+def test_rad_anchor_diffusion_actor_speed(benchmark, databases, batch):
     """TorchRL's own diffusion policy at as many network calls as a plan has, for comparison."""
     torch.manual_seed(0)
     actor = DiffusionActor(action_dim=2, obs_dim=4, num_steps=9).to(DEVICE)
-    observations = cycle(driven(database, batch).unbind(1))
-    run(benchmark, actor, lambda: TensorDict({"observation": next(observations)}, [batch]), batch)
+    endless = cycle(driven(databases["pointmaze"], batch).unbind(1))
+    run(benchmark, lambda: actor(TensorDict({"observation": next(endless)}, [batch])))
 
 
 if __name__ == "__main__":
