@@ -1,9 +1,13 @@
-"""Each loss forward, and forward and backward; one step of the optimisers."""
+"""Each loss forward, and forward and backward; one step of the optimisers, at two sizes."""
 
 from __future__ import annotations
 
 import argparse
 import gc
+from importlib.metadata import version
+from statistics import median
+from time import perf_counter
+from typing import NamedTuple
 
 import pytest
 import torch
@@ -25,10 +29,21 @@ from torchrl_rad import (
 from torchrl_rad.training import Objective, uses_bf16
 
 THREADS = 1
+VERSIONS = {name: version(name) for name in ("torch", "torchrl", "tensordict", "torchrl_rad")}
 DEVICE = torch.device("cuda:0" if torch.cuda.is_available() else "cpu")
-BATCH, HORIZON, JUMPS = 128, 129, (32, 8, 1)
-STATE, ACTION = 4, 2  # PointMaze's
+HORIZON, JUMPS = 129, (32, 8, 1)
 LOSSES = ["denoising", "step_estimation", "return_guidance", "behaviour_cloning"]
+
+
+class Size(NamedTuple):
+    batch: int  # windows
+    state: int
+    action: int
+    width: int
+    heads: int
+
+
+SIZES = {"pointmaze": Size(128, 4, 2, 256, 8), "antmaze": Size(256, 29, 8, 320, 10)}
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -41,35 +56,40 @@ def fixed_threads():
 
 @pytest.fixture(autouse=True)
 def stated(benchmark):
-    benchmark.extra_info.update(threads=THREADS, device=str(DEVICE), windows=BATCH, horizon=HORIZON)
+    benchmark.extra_info.update(threads=THREADS, device=str(DEVICE), versions=VERSIONS)
     yield
     gc.collect()  # losses and optimisers refer to each other
 
 
-@pytest.fixture(scope="module")
-def windows():
-    """Windows [BATCH, HORIZON] of random walks."""
+def make_windows(size: str) -> TensorDict:
+    """Windows [B, HORIZON] of random walks."""
+    batch, width, actions = SIZES[size][:3]
     generator = torch.Generator().manual_seed(0)
-    shape = (BATCH, HORIZON + 1, STATE)
-    walk = (0.05 * torch.randn(shape, generator=generator)).cumsum(1).to(DEVICE)
-    reward = torch.zeros(BATCH, HORIZON, 1, device=DEVICE)
+    walk = 0.05 * torch.randn(batch, HORIZON + 1, width, generator=generator)
+    walk = walk.cumsum(1).to(DEVICE)
     steps = {
         "observation": walk[:, :-1],
-        "action": torch.zeros(BATCH, HORIZON, ACTION, device=DEVICE),
-        "return_to_go": torch.ones(BATCH, HORIZON, device=DEVICE),
-        "next": {"observation": walk[:, 1:], "reward": reward},
+        "action": torch.zeros(batch, HORIZON, actions, device=DEVICE),
+        "return_to_go": torch.ones(batch, HORIZON, device=DEVICE),
+        "next": {
+            "observation": walk[:, 1:],
+            "reward": torch.zeros(batch, HORIZON, 1, device=DEVICE),
+        },
     }
-    return TensorDict(steps, [BATCH, HORIZON])
+    return TensorDict(steps, [batch, HORIZON])
 
 
-def make_objectives(process: str = "flow", bf16: bool = False) -> dict[str, Objective]:
-    """The four losses of DL-RAD at the recipe's sizes; they share no parameters."""
+def make_objectives(
+    size: str, process: str = "flow", bf16: tuple[str, ...] = ()
+) -> dict[str, Objective]:
+    """The four losses of DL-RAD, those named in bfloat16; they share no parameters."""
     torch.manual_seed(0)
-    states, difference = Normalizer.identity(STATE), Normalizer.identity(STATE)
-    inverse = InverseDynamics(states, difference, ACTION)
+    _, width, actions, inner, heads = SIZES[size]
+    states, difference = Normalizer.identity(width), Normalizer.identity(width)
+    inverse = InverseDynamics(states, difference, actions)
     guide = ReturnModel(states, tokens=(HORIZON - 1) // JUMPS[0] + 1)
     planner = DiffuserLitePlanner(
-        states, inverse, HORIZON, JUMPS, process=process, return_model=guide
+        states, inverse, HORIZON, JUMPS, inner, heads, process=process, return_model=guide
     ).to(DEVICE)
     estimator = StepEstimator(states, HORIZON).to(DEVICE)
     cloning = BCLoss(inverse_dynamics_actor(inverse), loss_function="l2")
@@ -80,9 +100,7 @@ def make_objectives(process: str = "flow", bf16: bool = False) -> dict[str, Obje
         (cloning, lambda w: w[:, :8].reshape(-1), None),
     ]
     return {
-        name: Objective(
-            loss, prepare, lr=5e-4, steps=10_000, ema=ema, bf16=bf16 and name == "denoising"
-        )
+        name: Objective(loss, prepare, lr=5e-4, steps=10_000, ema=ema, bf16=name in bf16)
         for name, (loss, prepare, ema) in zip(LOSSES, parts, strict=True)
     }
 
@@ -94,15 +112,36 @@ def finished(result):
     return result
 
 
-def run(benchmark, call, rounds: int = 10):
-    return benchmark.pedantic(lambda: finished(call()), rounds=rounds, warmup_rounds=2)
+def run(benchmark, call, plain=None, rounds: int = 10):
+    """Ten rounds; before each a plain call, if there is one, that counts for itself.
+
+    The machine is then as busy for the one as for the other.
+    """
+    times = []
+
+    def between():
+        begin = perf_counter()
+        finished(plain())
+        times.append(1e3 * (perf_counter() - begin))
+
+    setup = None if plain is None else between
+    result = benchmark.pedantic(
+        lambda: finished(call()), setup=setup, rounds=rounds, warmup_rounds=2
+    )
+    if times and benchmark.enabled:
+        plain_ms = median(times[2:])
+        ratio = plain_ms / (1e3 * benchmark.stats["median"])
+        benchmark.extra_info.update(plain_ms=plain_ms, ratio=ratio)
+    return result
 
 
-def measure_loss(benchmark, objective: Objective, windows, backward):
+def measure_loss(benchmark, objective: Objective, size: str, backward, bf16: bool = False):
+    windows = make_windows(size)
     loss, batch = objective.loss, objective.prepare(windows)
 
     def forward():
-        out = loss(batch)
+        with torch.autocast(DEVICE.type, torch.bfloat16, bf16):
+            out = loss(batch)
         return sum(out[key] for key in out.keys() if key.startswith("loss_"))
 
     def forward_and_backward():
@@ -111,43 +150,73 @@ def measure_loss(benchmark, objective: Objective, windows, backward):
         loss.zero_grad()
         return total
 
+    benchmark.extra_info["windows"] = len(windows)
     total = run(benchmark, forward_and_backward if backward else forward)
     assert total.isfinite()
 
 
-backward = pytest.mark.parametrize("backward", [None, "backward"], ids=["forward", "backward"])
-
-
-@backward
-@pytest.mark.parametrize("name", LOSSES)
-def test_rad_loss_speed(benchmark, windows, name, backward):
-    measure_loss(benchmark, make_objectives()[name], windows, backward)
-
-
-@backward
-def test_rad_diffusion_loss_speed(benchmark, windows, backward):
-    """The other generative process."""
-    measure_loss(benchmark, make_objectives("diffusion")["denoising"], windows, backward)
-
-
-@pytest.mark.parametrize("name", LOSSES)
-def test_rad_update_speed(benchmark, windows, name):
-    """One objective: loss, gradient, clipping, AdamW, average of the weights."""
-    objective = make_objectives()[name]
-    run(benchmark, lambda: objective.update(windows))
-
-
-@pytest.mark.parametrize("precision", ["fp32", "bf16"])
-def test_rad_training_step_speed(benchmark, windows, precision):
-    """All four objectives on the same windows, as a training of DL-RAD does."""
+def is_bf16(precision: str) -> bool:
     if precision == "bf16" and not uses_bf16("auto", DEVICE):
         pytest.skip("products of bfloat16 matrices are not faster on this device")
-    objectives = make_objectives(bf16=precision == "bf16")
+    return precision == "bf16"
 
-    def step():
-        return {name: objective.update(windows) for name, objective in objectives.items()}
 
-    run(benchmark, step)
+backward = pytest.mark.parametrize("backward", [None, "backward"], ids=["forward", "backward"])
+precisions = pytest.mark.parametrize("precision", ["fp32", "bf16"])
+sizes = pytest.mark.parametrize("size", SIZES)
+
+
+@backward
+@pytest.mark.parametrize("name", LOSSES)
+def test_rad_loss_speed(benchmark, name, backward):
+    measure_loss(benchmark, make_objectives("pointmaze")[name], "pointmaze", backward)
+
+
+@backward
+def test_rad_diffusion_loss_speed(benchmark, backward):
+    """The other generative process."""
+    objective = make_objectives("pointmaze", "diffusion")["denoising"]
+    measure_loss(benchmark, objective, "pointmaze", backward)
+
+
+@backward
+@precisions
+def test_rad_denoising_loss_speed(benchmark, precision, backward):
+    """The largest loss at the largest size, over all three levels, without the optimiser."""
+    bf16 = is_bf16(precision)
+    objective = make_objectives("antmaze")["denoising"]
+    measure_loss(benchmark, objective, "antmaze", backward, bf16)
+
+
+def measure_update(benchmark, size: str, names: list[str], bf16: tuple[str, ...]):
+    """One step of each objective named; where some are in bfloat16, beside all in float32."""
+    windows = make_windows(size)
+
+    def step_of(objectives):
+        return lambda: [objectives[name].update(windows) for name in names]
+
+    step = step_of(make_objectives(size, bf16=bf16))
+    plain = step_of(make_objectives(size)) if bf16 else None
+    benchmark.extra_info["windows"] = len(windows)
+    run(benchmark, step, plain)
+
+
+@sizes
+@precisions
+@pytest.mark.parametrize("name", LOSSES)
+def test_rad_update_speed(benchmark, size, name, precision):
+    """One objective: loss, gradient, clipping, AdamW, average of the weights."""
+    measure_update(benchmark, size, [name], (name,) if is_bf16(precision) else ())
+
+
+@sizes
+@precisions
+def test_rad_training_step_speed(benchmark, size, precision):
+    """All four objectives on the same windows, as a training of DL-RAD does.
+
+    Only the denoising is done in bfloat16, the others are small.
+    """
+    measure_update(benchmark, size, LOSSES, ("denoising",) if is_bf16(precision) else ())
 
 
 if __name__ == "__main__":

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from importlib.metadata import version
 
 import pytest
 import torch
@@ -12,6 +13,7 @@ from torchrl.data import SliceSampler, TensorDictReplayBuffer, TensorStorage
 from torchrl_rad import window_buffer
 
 THREADS = 1
+VERSIONS = {name: version(name) for name in ("torch", "torchrl", "tensordict", "torchrl_rad")}
 DEVICE = torch.device("cuda:0" if torch.cuda.is_available() else "cpu")
 EPISODE = 500  # steps
 
@@ -26,7 +28,7 @@ def fixed_threads():
 
 @pytest.fixture(autouse=True)
 def stated(benchmark):
-    benchmark.extra_info.update(threads=THREADS, device=str(DEVICE))
+    benchmark.extra_info.update(threads=THREADS, device=str(DEVICE), versions=VERSIONS)
 
 
 @pytest.fixture(scope="module", params=[10_000, 100_000, 1_000_000], ids=["10k", "100k", "1M"])
@@ -79,6 +81,7 @@ def test_rad_window_sampling_speed(benchmark, steps, buffer, length, batch):
             torch.cuda.synchronize(DEVICE)
         return windows
 
+    benchmark.extra_info["buffer"] = buffer.__name__
     windows = benchmark.pedantic(sample, rounds=20, warmup_rounds=2)
     assert len(windows) == batch
     assert (windows["episode"] == windows["episode"][:, :1]).all()
