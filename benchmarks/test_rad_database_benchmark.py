@@ -137,7 +137,7 @@ def test_rad_database_extend_speed(benchmark, rows, dims):
         return (empty_database(rows), steps), {}
 
     benchmark.pedantic(lambda d, s: finished(d.extend(s)), setup=fresh, rounds=3)
-    benchmark.extra_info["payload_bytes"] = steps.bytes()
+    benchmark.extra_info.update(timed="extend", megabytes=round(steps.bytes() / 1e6, 1))
 
 
 def test_rad_index_build_speed(benchmark, database):
@@ -159,6 +159,7 @@ def test_rad_index_build_speed(benchmark, database):
     payload, structure = database[:].bytes(), own_bytes(index, database)
     columns = own_bytes([index, select], database) - structure
     benchmark.extra_info.update(
+        timed="index",
         index=type(index).__name__,
         payload_bytes=payload,
         index_bytes=structure,
@@ -172,6 +173,7 @@ copied = pytest.mark.parametrize("memmap", [False, True], ids=["copied", "memmap
 
 @copied
 def test_rad_database_load_speed(benchmark, saved, memmap):
+    benchmark.extra_info["timed"] = "load, memmap" if memmap else "load, copied"
     benchmark.pedantic(ExpertDatabase.loads, (saved,), {"memmap": memmap}, rounds=3)
 
 
@@ -179,6 +181,7 @@ def test_rad_database_load_speed(benchmark, saved, memmap):
 def test_rad_first_answer_speed(benchmark, database, saved, memmap):
     """From a folder to the neighbours of a state: opening, reading, indexing, searching."""
     state = queries(database)[:1]
+    benchmark.extra_info["timed"] = "first answer, memmap" if memmap else "first answer, copied"
 
     def answer():
         return finished(ExpertDatabase.loads(saved, memmap=memmap).retrieve(state))

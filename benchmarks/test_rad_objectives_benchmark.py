@@ -150,7 +150,7 @@ def measure_loss(benchmark, objective: Objective, size: str, backward, bf16: boo
         loss.zero_grad()
         return total
 
-    benchmark.extra_info["windows"] = len(windows)
+    benchmark.extra_info.update(windows=len(windows), calls=backward or "forward")
     total = run(benchmark, forward_and_backward if backward else forward)
     assert total.isfinite()
 
@@ -197,7 +197,8 @@ def measure_update(benchmark, size: str, names: list[str], bf16: tuple[str, ...]
 
     step = step_of(make_objectives(size, bf16=bf16))
     plain = step_of(make_objectives(size)) if bf16 else None
-    benchmark.extra_info["windows"] = len(windows)
+    objective = names[0] if len(names) == 1 else "all"
+    benchmark.extra_info.update(windows=len(windows), objective=objective)
     run(benchmark, step, plain)
 
 

@@ -81,7 +81,7 @@ def test_rad_window_sampling_speed(benchmark, steps, buffer, length, batch):
             torch.cuda.synchronize(DEVICE)
         return windows
 
-    benchmark.extra_info["buffer"] = buffer.__name__
+    benchmark.extra_info.update(buffer=buffer.__name__, windows=batch)
     windows = benchmark.pedantic(sample, rounds=20, warmup_rounds=2)
     assert len(windows) == batch
     assert (windows["episode"] == windows["episode"][:, :1]).all()
