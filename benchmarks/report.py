@@ -179,12 +179,13 @@ def heading(content: dict[str, Any], entries: Entries) -> str:
     versions = {"Python": machine.get("python_version", "?")}
     for entry in entries:
         versions.update(entry.values.get("versions", {}))
+    short = re.sub(r"(?<=^[0-9a-f]{7})[0-9a-f]+$", "", commit.get("id", "?"))
     changed = " with changes" if commit.get("dirty") else ""
     return (
         f"{cpu.get('brand_raw', 'unknown processor')}, {cpu.get('count', '?')} cores, "
         f"{' and '.join(threads)} thread(s), {' and '.join(devices)}; "
         f"{', '.join(f'{name} {value}' for name, value in versions.items())}; "
-        f"commit {str(commit.get('id', '?'))[:7]}{changed}, {content.get('datetime', '?')[:10]}. "
+        f"commit {short}{changed}, {content.get('datetime', '?')[:10]}. "
         "Times are medians in ms; a ratio is the time of the plain way over ours, from one test."
     )
 

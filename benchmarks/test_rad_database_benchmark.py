@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import gc
 import shutil
+from collections import deque
 from importlib.metadata import version
 
 import numpy as np
@@ -112,7 +113,7 @@ def blocks(thing) -> dict[int, int]:
     elif type(thing).__module__.startswith("torchrl_rad") and hasattr(thing, "__dict__"):
         thing = list(vars(thing).values())
     held: dict[int, int] = {}
-    for part in thing if isinstance(thing, (list, tuple)) else []:
+    for part in thing if isinstance(thing, (list, tuple, deque)) else []:
         for address, size in blocks(part).items():
             held[address] = max(size, held.get(address, 0))
     return held

@@ -83,22 +83,27 @@ def databases():
     return {size: make_database(size) for size in SIZES}
 
 
-def asked_precision(precision: str) -> dict[str, str]:
-    """The planner's keyword, or a skip where this machine or version has nothing to gain."""
+PARAMETERS = inspect.signature(DiffuserLitePlanner.__init__).parameters
+
+
+def keyword(precision: str) -> dict[str, str]:
+    """The planner's own, if this version has it."""
     if precision == "bf16" and not uses_bf16("auto", DEVICE):
         pytest.skip("products of bfloat16 matrices are not faster on this device")
-    if "precision" in inspect.signature(DiffuserLitePlanner.__init__).parameters:
-        return {"precision": precision}
-    if precision == "bf16":
-        pytest.skip("this version of the planner has float32 only")
-    return {}
+    return {"precision": precision} if "precision" in PARAMETERS else {}
+
+
+def lowered(precision: str) -> torch.autocast:
+    """What a version without the keyword plans under."""
+    without = precision == "bf16" and "precision" not in PARAMETERS
+    return torch.autocast(DEVICE.type, torch.bfloat16, without)
 
 
 def make_policy(database, size, rule="highest", precision="fp32", target=True, **planner):
     """A policy as the recipe's, with random weights: they do not change what a plan costs."""
     torch.manual_seed(0)
     state, action, width, heads, steps = SIZES[size]
-    planner.update(width=width, heads=heads, steps=steps, **asked_precision(precision))
+    planner.update(width=width, heads=heads, steps=steps, **keyword(precision))
     description = {"state_dim": state, "action_dim": action, "planner": planner, "target": None}
     if target:
         description["target"] = {"rule": rule}
@@ -209,7 +214,11 @@ def measure_plan(benchmark, database, size, process, candidates, batch, precisio
     def plain():
         times.append(spent(lambda: plain_plan(planner, told)))
 
-    planned = run(benchmark, lambda: planner(told.copy()), plain)
+    def plan():
+        with lowered(precision):
+            return planner(told.copy())
+
+    planned = run(benchmark, plan, plain)
     assert planned["plan"].isfinite().all()
     if benchmark.enabled:
         plain_ms = float(np.median(times[1:]))
@@ -282,10 +291,16 @@ def test_rad_policy_speed(benchmark, databases, size, candidates, batch, rule, p
     policy = make_policy(databases[size], size, rule, **options)
     states = driven(databases[size], batch)
     endless = cycle(states.unbind(1))
-    acted = run(benchmark, lambda: policy(TensorDict({"observation": next(endless)}, [batch])))
+
+    def act():
+        with lowered(precision):
+            return policy(TensorDict({"observation": next(endless)}, [batch]))
+
+    acted = run(benchmark, act)
     assert acted["action"].isfinite().all()
     calls = min(DRIVEN, 2 + benchmark.stats["rounds"]) if benchmark.enabled else 3
-    times = split_times(policy, states[:, :calls])
+    with lowered(precision):
+        times = split_times(policy, states[:, :calls])
     share = (times["TS"]["p50"] + times["SE"]["p50"]) / times["total"]["p50"]
     benchmark.extra_info.update(size=size, milliseconds=times, share_of_ts_and_se=share)
 
