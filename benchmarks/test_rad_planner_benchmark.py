@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import inspect
 from importlib.metadata import version
 from itertools import cycle, pairwise, product
 from time import perf_counter
@@ -16,7 +15,7 @@ from tensordict import TensorDict
 from torchrl.data import LazyTensorStorage
 from torchrl.modules import DiffusionActor
 
-from torchrl_rad import DiffuserLitePlanner, ExpertDatabase, RetrievalSampler
+from torchrl_rad import ExpertDatabase, RetrievalSampler
 from torchrl_rad.policy import build_policy, fit_scales
 from torchrl_rad.training import uses_bf16
 
@@ -83,27 +82,18 @@ def databases():
     return {size: make_database(size) for size in SIZES}
 
 
-PARAMETERS = inspect.signature(DiffuserLitePlanner.__init__).parameters
-
-
-def keyword(precision: str) -> dict[str, str]:
-    """The planner's own, if this version has it."""
+def lowered(precision: str) -> torch.autocast:
+    """What a plan is made under."""
     if precision == "bf16" and not uses_bf16("auto", DEVICE):
         pytest.skip("products of bfloat16 matrices are not faster on this device")
-    return {"precision": precision} if "precision" in PARAMETERS else {}
+    return torch.autocast(DEVICE.type, torch.bfloat16, precision == "bf16")
 
 
-def lowered(precision: str) -> torch.autocast:
-    """What a version without the keyword plans under."""
-    without = precision == "bf16" and "precision" not in PARAMETERS
-    return torch.autocast(DEVICE.type, torch.bfloat16, without)
-
-
-def make_policy(database, size, rule="highest", precision="fp32", target=True, **planner):
+def make_policy(database, size, rule="highest", target=True, **planner):
     """A policy as the recipe's, with random weights: they do not change what a plan costs."""
     torch.manual_seed(0)
     state, action, width, heads, steps = SIZES[size]
-    planner.update(width=width, heads=heads, steps=steps, **keyword(precision))
+    planner.update(width=width, heads=heads, steps=steps)
     description = {"state_dim": state, "action_dim": action, "planner": planner, "target": None}
     if target:
         description["target"] = {"rule": rule}
@@ -200,8 +190,7 @@ def assert_same_plan(planner, told):
 @torch.no_grad()
 def measure_plan(benchmark, database, size, process, candidates, batch, precision):
     """PL alone, told of targets, and the plain plan beside it."""
-    options = {"process": process, "candidates": candidates, "precision": precision}
-    select, estimate, planner = make_policy(database, size, **options)
+    select, estimate, planner = make_policy(database, size, process=process, candidates=candidates)
     state = driven(database, batch)[:, 0]
     told = estimate(select(TensorDict({"observation": state}, [batch])))
     assert told["found"].all()
@@ -287,8 +276,7 @@ def split_times(policy, states) -> dict[str, dict[str, float]]:
 @torch.no_grad()
 def test_rad_policy_speed(benchmark, databases, size, candidates, batch, rule, process, precision):
     """The times of TS, SE, PL and inverse dynamics go into extra_info."""
-    options = {"process": process, "candidates": candidates, "precision": precision}
-    policy = make_policy(databases[size], size, rule, **options)
+    policy = make_policy(databases[size], size, rule, process=process, candidates=candidates)
     states = driven(databases[size], batch)
     endless = cycle(states.unbind(1))
 
