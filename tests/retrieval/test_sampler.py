@@ -171,7 +171,7 @@ def test_nested_key():
     "settings, message",
     [
         ({"metric": "manhattan"}, "metric is 'manhattan'; expected 'cosine' or 'euclidean'"),
-        ({"backend": "faiss"}, "backend is 'faiss'; expected one of"),
+        ({"backend": "grid"}, "backend is 'grid'; expected one of"),
         ({"k": 0}, "k is 0; at least one neighbour"),
         ({"threshold": 1.01}, r"threshold is 1.01; .* lies in \[0, 1\]"),
         ({"threshold": -0.1}, r"threshold is -0.1; .* lies in \[0, 1\]"),

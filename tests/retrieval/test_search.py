@@ -45,7 +45,7 @@ def test_equals_brute_force(backend, metric, values, data):
     query = torch.tensor(data.draw(st.lists(state, min_size=1, max_size=4)))
     k = data.draw(st.integers(1, len(rows)))
     with mock.patch.object(search, "SPARE", data.draw(st.sampled_from([0, 1, 32]))):
-        assert_exact(build_index(rows, metric, backend), query, rows, metric, k)
+        assert_exact(build_index(rows, metric, backend, k), query, rows, metric, k)
 
 
 @pytest.mark.parametrize("metric", ["euclidean", "cosine"])
@@ -148,7 +148,7 @@ def test_too_far_for_a_distance():
 
 @both
 def test_one_row(backend, metric):
-    index = build_index(torch.tensor([[3.0, 4.0]]), metric, backend)
+    index = build_index(torch.tensor([[3.0, 4.0]]), metric, backend, 1)
     near, found = index.search(torch.tensor([[3.0, 4.0], [6.0, 8.0]]), 1)
     assert found.tolist() == [[0], [0]]
     assert near.tolist() == ([[1.0], [1.0]] if metric == "cosine" else [[1.0], [1 / 6]])
@@ -159,7 +159,7 @@ def test_batch_of_one_equals_batch_of_many(backend, metric):
     generator = torch.Generator().manual_seed(0)
     rows = torch.randn(500, 3, generator=generator)
     query = torch.randn(37, 3, generator=generator)
-    index = build_index(rows, metric, backend)
+    index = build_index(rows, metric, backend, 50)
     near, found = index.search(query, 50)
     for number in range(len(query)):
         alone, place = index.search(query[number : number + 1], 50)
@@ -192,21 +192,21 @@ def test_zero_vectors_come_last_for_cosine():
 
 
 def test_auto_takes_the_tree_for_few_dims_only():
-    assert isinstance(build_index(torch.zeros(4, 3), "euclidean", "auto"), TreeIndex)
-    assert isinstance(build_index(torch.zeros(4, 4), "euclidean", "auto"), ListIndex)
-    assert isinstance(build_index(torch.zeros(4, 2), "cosine", "auto"), ListIndex)
-    assert isinstance(build_index(torch.zeros(4, 4), "euclidean", "scan"), ScanIndex)
-    assert isinstance(build_index(torch.zeros(4, 9), "euclidean", "tree"), TreeIndex)
+    assert isinstance(build_index(torch.zeros(4, 3), "euclidean", "auto", 1), TreeIndex)
+    assert isinstance(build_index(torch.zeros(4, 4), "euclidean", "auto", 1), ListIndex)
+    assert isinstance(build_index(torch.zeros(4, 2), "cosine", "auto", 1), ListIndex)
+    assert isinstance(build_index(torch.zeros(4, 4), "euclidean", "scan", 1), ScanIndex)
+    assert isinstance(build_index(torch.zeros(4, 9), "euclidean", "tree", 1), TreeIndex)
 
 
 def test_tree_needs_a_euclidean_metric():
     with pytest.raises(ValueError, match="backend='tree' needs metric='euclidean'.*'cosine'"):
-        build_index(torch.zeros(4, 2), "cosine", "tree")
+        build_index(torch.zeros(4, 2), "cosine", "tree", 1)
 
 
 def test_tree_needs_the_cpu():
     with pytest.raises(ValueError, match="rows on the CPU.*on meta.*backend='scan'"):
-        build_index(torch.zeros(4, 2, device="meta"), "euclidean", "tree")
+        build_index(torch.zeros(4, 2, device="meta"), "euclidean", "tree", 1)
 
 
 def test_rows_are_not_changed():

@@ -6,13 +6,14 @@ from typing import Protocol
 
 from torch import Tensor
 
+from torchrl_rad.retrieval.approximate import FaissIndex
 from torchrl_rad.retrieval.choice import Candidates, Metric
 from torchrl_rad.retrieval.lists import ListIndex
 from torchrl_rad.retrieval.search import ScanIndex, TreeIndex
 
 __all__ = ["BACKENDS", "SearchIndex", "build_index"]
 
-BACKENDS = ("auto", "scan", "tree")
+BACKENDS = ("auto", "scan", "tree", "faiss")
 TREE_DIMS = 3  # beyond, a scan of k in the hundreds is faster
 
 
@@ -37,15 +38,23 @@ class SearchIndex(Protocol):
         """Rows among which the k most similar ones are, without their exact order."""
 
 
-def build_index(rows: Tensor, metric: Metric, backend: str) -> SearchIndex:
-    """The search structure for rows [N, D].
+def build_index(rows: Tensor, metric: Metric, backend: str, k: int) -> SearchIndex:
+    """The search structure for rows [N, D] of which k are asked for.
 
-    ``backend`` is ``"scan"``, ``"tree"``, or ``"auto"`` for what is fastest along a trajectory.
+    ``backend`` is one of ``BACKENDS``; ``"auto"`` takes what is fastest along a trajectory.
 
     Raises:
-        ValueError: a tree is asked for cosine similarity, or for rows that are not on the CPU.
+        ImportError: faiss is asked for and is not installed.
+        ValueError: a tree is asked for cosine similarity, a tree or faiss for rows that are not on
+            the CPU; faiss misses too many neighbours.
     """
     fits = metric == "euclidean" and rows.device.type == "cpu"
+    if backend == "faiss":
+        if rows.device.type != "cpu":
+            raise ValueError(
+                f"backend='faiss' needs rows on the CPU, got {rows.device}. Use backend='auto'."
+            )
+        return FaissIndex(rows, metric, k)
     if backend == "tree" and not fits:
         raise ValueError(
             f"backend='tree' needs metric='euclidean' and rows on the CPU; got metric={metric!r} "
