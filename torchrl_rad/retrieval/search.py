@@ -42,8 +42,11 @@ class ScanIndex:
 
     def __init__(self, rows: Tensor, metric: Metric):
         self.rows, self.metric = rows, metric
-        parts = rows.split(max(1, SCAN_ENTRIES // rows.shape[-1]))
-        size = torch.cat([part.double().norm(dim=-1) for part in parts])
+        # written in place: results kept between the copies would leave holes in memory
+        size = torch.empty(len(rows), dtype=torch.float64, device=rows.device)
+        chunk = max(1, SCAN_ENTRIES // rows.shape[-1])
+        for part, norm in zip(rows.split(chunk), size.split(chunk), strict=True):
+            norm.copy_(part.double().norm(dim=-1))
         self.largest = float(size.max()) if len(rows) else 0.0
         # beyond, squares leave the range of float32
         narrow = bool(((size == 0) | ((size > TINY) & (size < HUGE))).all()) and self.largest > 0
