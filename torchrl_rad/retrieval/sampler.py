@@ -25,6 +25,11 @@ def storage_revision(storage: Any) -> tuple[int, int, int | None]:
     return id(storage), len(storage), getattr(storage, "_mutation_revision", None)
 
 
+def _joined(parts: list[tuple[Tensor, ...]]) -> tuple[Tensor, ...]:
+    """Columns of results, whole again."""
+    return parts[0] if len(parts) == 1 else tuple(map(torch.cat, zip(*parts, strict=True)))
+
+
 class RetrievalSampler(Sampler):
     """Finds the rows of a storage that are most similar to a query (TS of RAD, first step).
 
@@ -156,10 +161,7 @@ class RetrievalSampler(Sampler):
             return rows, torch.empty(len(query), 0, dtype=torch.float64)
         index, query, finite = self._ready(storage, query)
         k = min(self.k, count)
-        near, rows = (
-            torch.cat(p)
-            for p in zip(*(index.search(q, k) for q in self._parts(query, k)), strict=True)
-        )
+        near, rows = _joined([index.search(part, k) for part in self._parts(query, k)])
         if finite is not None:
             near, rows = torch.where(finite, near, -torch.inf), torch.where(finite, rows, -1)
         return rows, near
@@ -180,12 +182,8 @@ class RetrievalSampler(Sampler):
         """
         index, query, finite = self._ready(storage, query)
         k = min(self.k, len(storage))
-        row, near, hit = (
-            torch.cat(p)
-            for p in zip(
-                *(self._best(index, q, k, rank) for q in self._parts(query, k)), strict=True
-            )
-        )
+        parts = self._parts(query, k)
+        row, near, hit = _joined([self._best(index, part, k, rank) for part in parts])
         if finite is not None:
             finite = finite[:, 0]
             near, row = torch.where(finite, near, -torch.inf), torch.where(finite, row, -1)
@@ -211,7 +209,8 @@ class RetrievalSampler(Sampler):
 
     def _parts(self, query: Tensor, k: int) -> tuple[Tensor, ...]:
         """Queries by so many that the states of their neighbours are SCAN_ENTRIES at most."""
-        return query.split(max(1, search.SCAN_ENTRIES // (k * max(1, query.shape[-1]))))
+        most = max(1, search.SCAN_ENTRIES // (k * max(1, query.shape[-1])))
+        return query.split(most) if len(query) > most else (query,)
 
     def _ready(self, storage: Any, query: Tensor) -> tuple[SearchIndex, Tensor, Tensor | None]:
         """The search structure, queries as it wants them, and which are finite if not all are."""
