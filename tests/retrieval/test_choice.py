@@ -89,6 +89,8 @@ def test_most_answers_are_sure():
 
 @pytest.mark.parametrize("size", [1e160, 1e300])
 def test_a_query_too_far_for_the_tree_is_doubtful(size):
-    found = TreeIndex(torch.randn(9, 2)).candidates(torch.full((1, 2), size).double(), 3)
+    found = TreeIndex(torch.randn(9, 2)).candidates(
+        torch.full((1, 2), size, dtype=torch.float64), 3
+    )
     _, sure = choose(found, torch.arange(9), 0.0, "euclidean", 3)
     assert not sure.any()

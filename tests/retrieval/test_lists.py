@@ -17,6 +17,7 @@ METRICS = ["euclidean", "cosine"]
 def small_lists(monkeypatch):
     """Lists also of few rows."""
     monkeypatch.setattr(lists, "SHARE", 2)
+    monkeypatch.setattr(lists, "ENOUGH", 2)
 
 
 def walks(episodes=20, length=50, width=5, step=0.05, seed=0):
@@ -67,7 +68,8 @@ def test_any_sequence_of_queries(metric, values, data):
     batch = data.draw(st.integers(1, 2))
     index = ListIndex(ScanIndex(rows, metric))
     query = torch.tensor([data.draw(state) for _ in range(batch)], dtype=torch.float64)
-    with mock.patch.object(lists, "SHARE", 1), mock.patch.object(search, "SPARE", 0):
+    short = mock.patch.multiple(lists, SHARE=1, ENOUGH=2)
+    with short, mock.patch.object(search, "SPARE", 0):
         for _ in range(6):
             near, row = index.search(query, k)
             for q, n, r in zip(query.tolist(), near.tolist(), row.tolist(), strict=True):

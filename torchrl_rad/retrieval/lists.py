@@ -14,6 +14,7 @@ __all__ = ["ListIndex"]
 
 LIST_ENTRIES = 2**21  # entries of states in all lists together: 8 MiB of float32
 SHARE = 16  # a list holds at most one row in so many
+ENOUGH = 8  # times k rows make a list that lasts; shorter ones cost more than they save
 LONGEST_PAUSE = 64  # searches
 
 
@@ -84,7 +85,7 @@ class ListIndex:
         """As :meth:`ScanIndex.candidates`."""
         query, kept = query.double(), self.scan.kept(k)
         longest = min(LIST_ENTRIES // max(1, query.numel()), len(self.rows) // SHARE)
-        if longest < max(kept, 2 * k) or len(query) == 0 or self.waited < self.pause:
+        if longest < max(kept, ENOUGH * k) or len(query) == 0 or self.waited < self.pause:
             self.waited += 1
             return self._search_all(query, k)
         point = self.scan.unit(query) if self.metric == "cosine" else query
