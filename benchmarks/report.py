@@ -211,7 +211,7 @@ def target_panels(entries: Entries) -> list[Panel]:
         part = chosen(found, test, queries=queries)
         for k in distinct(part, "k"):
             lines = []
-            for colour, dims in zip(COLOURS, distinct(part, "dims"), strict=False):
+            for colour, dims in zip(COLOURS, distinct(found, "dims"), strict=False):
                 one = chosen(part, test, k=k, dims=dims)
                 lines.append((one, "p50_ms", {"color": colour, "label": f"{dims} dims"}))
                 lines.append((one, "plain_scan_ms", {"color": colour, **PLAIN}))

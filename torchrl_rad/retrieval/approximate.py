@@ -12,6 +12,7 @@ from torchrl_rad.retrieval.choice import (
     Candidates,
     Metric,
     most_similar,
+    ordered,
     rounding,
     similarity,
     square_distance,
@@ -110,6 +111,11 @@ class FaissIndex:
         zero = torch.zeros(len(query), dtype=torch.float64)
         found = Candidates(-square_distance(near, self.metric) / 2, row, zero, zero)
         return found._replace(error=rounding(found, self.metric, query.shape[-1]))
+
+    def order(self, found: Candidates, query: Tensor, k: int) -> tuple[Tensor, Tensor]:
+        """As :meth:`ScanIndex.order`."""
+        near, row, _ = ordered(found, query.double(), self.rows, self.metric, k)
+        return near, row
 
 
 def _faiss() -> Any:

@@ -37,6 +37,9 @@ class SearchIndex(Protocol):
     def candidates(self, query: Tensor, k: int) -> Candidates:
         """Rows among which the k most similar ones are, without their exact order."""
 
+    def order(self, found: Candidates, query: Tensor, k: int) -> tuple[Tensor, Tensor]:
+        """The answer of :meth:`search` from that of :meth:`candidates`."""
+
 
 def build_index(rows: Tensor, metric: Metric, backend: str, k: int) -> SearchIndex:
     """The search structure for rows [N, D] of which k are asked for.

@@ -74,7 +74,11 @@ class ListIndex:
 
     def search(self, query: Tensor, k: int) -> tuple[Tensor, Tensor]:
         """As :meth:`ScanIndex.search`."""
-        query, found = query.double(), self.candidates(query, k)
+        return self.order(self.candidates(query, k), query, k)
+
+    def order(self, found: Candidates, query: Tensor, k: int) -> tuple[Tensor, Tensor]:
+        """As :meth:`ScanIndex.order`."""
+        query = query.double()
         near, index, least = ordered(found, query, self.rows, self.metric, k)
         doubt = ~(found.score[:, -1] < least)
         if doubt.any():

@@ -12,7 +12,7 @@ from torchrl.data.replay_buffers.samplers import Sampler
 
 from torchrl_rad.retrieval import search
 from torchrl_rad.retrieval.backends import BACKENDS, SearchIndex, build_index
-from torchrl_rad.retrieval.choice import Metric, choose, similarity
+from torchrl_rad.retrieval.choice import Candidates, Metric, choose, similarity
 
 __all__ = ["RetrievalSampler", "storage_revision"]
 
@@ -199,7 +199,8 @@ class RetrievalSampler(Sampler):
         hit = torch.ones_like(sure)
         if not sure.all():
             doubt = ~sure
-            nears, rows = index.search(query[doubt], k)
+            again = Candidates(*(part[doubt] for part in found))
+            nears, rows = index.order(again, query[doubt], k)
             valid = nears >= self.threshold
             # the first place of the largest: rows come by similarity
             place = torch.where(valid, rank[rows], -1).argmax(-1, keepdim=True)

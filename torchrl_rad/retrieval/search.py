@@ -65,7 +65,10 @@ class ScanIndex:
             Similarities, float64 [Q, k], falling, and row numbers, int64 [Q, k]; ties by the lower
             row.
         """
-        found = self.candidates(query, k)
+        return self.order(self.candidates(query, k), query, k)
+
+    def order(self, found: Candidates, query: Tensor, k: int) -> tuple[Tensor, Tensor]:
+        """The answer of :meth:`search` from that of :meth:`candidates`."""
         query = query.double()
         near, index, least = ordered(found, query, self.rows, self.metric, k)
         for row in (~(found.score[:, -1] < least)).nonzero().flatten().tolist():  # ties, mostly
@@ -159,7 +162,10 @@ class TreeIndex:
 
     def search(self, query: Tensor, k: int) -> tuple[Tensor, Tensor]:
         """As :meth:`ScanIndex.search`."""
-        found = self.candidates(query, k)
+        return self.order(self.candidates(query, k), query, k)
+
+    def order(self, found: Candidates, query: Tensor, k: int) -> tuple[Tensor, Tensor]:
+        """As :meth:`ScanIndex.order`."""
         if found.score[:, -1:].isinf().any():  # too far for the tree, which then finds nothing
             return ScanIndex(self.rows, self.metric).search(query, k)
         query = query.double()
