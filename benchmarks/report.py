@@ -262,7 +262,7 @@ def draw(panels: list[Panel], path: Path) -> None:
     """The panels side by side, one legend below them."""
     from matplotlib import pyplot
 
-    size = (3.0 * len(panels) + 0.6, 3.2)
+    size = (max(3.0 * len(panels) + 0.6, 6.2), 3.2)  # as wide as the legend
     figure, axes = pyplot.subplots(1, len(panels), figsize=size, sharey=True, squeeze=False)
     legend = {}
     for axis, panel in zip(axes[0], panels, strict=True):
