@@ -142,6 +142,11 @@ def test_keys_are_kept_apart():
     assert cache.get(network, 1, lambda: "anew") == 2
 
 
+def test_a_module_without_weights():
+    cache, module = FrozenCache(), nn.ReLU()
+    assert [cache.get(module, 0, lambda value=value: value) for value in (1, 2)] == [1, 1]
+
+
 def test_functional_weights_are_noticed_and_go_again():
     cache, network = FrozenCache(), trained()
     other = TensorDictParams(TensorDict.from_module(trained(seed=5)).data.clone())

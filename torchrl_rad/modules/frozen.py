@@ -251,7 +251,7 @@ class FrozenCache:
         if not same:
             self.state = state
             self.samples = [p.detach().flatten() if p.ndim < 2 else p[0] for p in parameters]
-        sample = torch.cat(self.samples)
+        sample = torch.cat(self.samples) if self.samples else torch.empty(0)
         if not same or not torch.equal(sample, self.before):
             self.before, self.made = sample, {}
         if key not in self.made:
