@@ -6,7 +6,8 @@ from tensordict import TensorDict
 from torchrl.data import LazyTensorStorage
 
 from torchrl_rad import ExpertDatabase, RetrievalSampler, RetrievalTargetModule
-from torchrl_rad.retrieval.rules import RankedRule, TolerantRule, followed_rule, highest_rule
+from torchrl_rad.retrieval.choice import first_by_rank
+from torchrl_rad.retrieval.rules import TolerantRule, followed_rule, highest_rule
 
 from ..oracle import target_of
 
@@ -15,9 +16,17 @@ VALUES = torch.tensor([1.0, 3.0, 2.0, 3.0, 0.0, 3.0, 2.5, 9.0])
 REMAINING = torch.tensor([4, 3, 2, 1, 0, 2, 1, 0])
 
 
+def apply(rule, rows, valid):
+    """Target and place of each state by either kind of rule."""
+    if isinstance(rule, TolerantRule):
+        return rule(rows, valid)
+    place = first_by_rank(rule.rank, rows, valid)
+    return rule.target[rows.gather(-1, place)[:, 0]], place
+
+
 def choose(rule, rows):
     """Target and place for one state with these neighbours, most similar first."""
-    target, place = rule(torch.tensor([rows]), torch.ones(1, len(rows), dtype=torch.bool))
+    target, place = apply(rule, torch.tensor([rows]), torch.ones(1, len(rows), dtype=torch.bool))
     return target.item(), place.item()
 
 
@@ -87,15 +96,16 @@ def test_followed_by_hand(ahead, rows, expected):
 )
 def test_places_that_hold_no_neighbour_do_not_count(rule):
     rows = torch.tensor([[0, 7], [2, 7]])
-    target, place = rule(rows, torch.tensor([[True, False], [True, False]]))
+    target, place = apply(rule, rows, torch.tensor([[True, False], [True, False]]))
     assert target.tolist() == [choose(rule, [0])[0], choose(rule, [2])[0]]
     assert place.tolist() == [[0], [0]]
     # none at all: no error, and the first place
-    assert rule(rows, torch.zeros(2, 2, dtype=torch.bool))[1].tolist() == [[0], [0]]
+    assert apply(rule, rows, torch.zeros(2, 2, dtype=torch.bool))[1].tolist() == [[0], [0]]
 
 
 def test_ranks_take_half_the_memory():
-    assert RankedRule(torch.arange(3), torch.arange(3)).rank.dtype == torch.int32
+    assert followed_rule(VALUES, REMAINING, 2).rank.dtype == torch.int32
+    assert highest_rule(VALUES, REMAINING, 3).rank.dtype == torch.int32
 
 
 # the whole target rule, from the state on

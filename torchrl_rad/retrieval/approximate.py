@@ -13,10 +13,11 @@ from torchrl_rad.retrieval.choice import (
     Metric,
     most_similar,
     ordered,
-    rounding,
+    rounded,
     similarity,
     square_distance,
 )
+from torchrl_rad.retrieval.index import SearchIndex
 from torchrl_rad.retrieval.search import ScanIndex
 
 __all__ = ["FaissIndex"]
@@ -26,7 +27,7 @@ SAMPLE = 200  # queries that it is measured with
 MOST_PROBED = 4  # of so many cells one is looked at, at most: beyond, a scan is as fast
 
 
-class FaissIndex:
+class FaissIndex(SearchIndex):
     """faiss's inverted file: rows in cells, of which those near a query are looked at.
 
     How many are, is found out when it is built: as few as find 99 % of the k nearest rows, measured
@@ -72,7 +73,7 @@ class FaissIndex:
         aside = torch.randn(states.shape, generator=generator, dtype=torch.float64)
         query = states + 0.01 * aside * states.std(0, correction=0)
         exact = torch.cat([self.scan.search(part, k)[0] for part in query.split(16)])
-        most = max(1, cells // MOST_PROBED) if cells > 1 else 1
+        most = max(1, cells // MOST_PROBED)
         probes = 1
         while True:
             self.index.nprobe = min(probes, most)
@@ -97,7 +98,7 @@ class FaissIndex:
         return near, row, missing
 
     def search(self, query: Tensor, k: int) -> tuple[Tensor, Tensor]:
-        """As :meth:`ScanIndex.search`, but some rows may be others, less similar."""
+        """As :meth:`SearchIndex.search`, but some rows may be others, less similar."""
         if len(query) == 0:
             return self.scan.search(query, k)
         near, row, missing = self._found(query, k)
@@ -106,14 +107,13 @@ class FaissIndex:
         return near, row
 
     def candidates(self, query: Tensor, k: int) -> Candidates:
-        """As :meth:`ScanIndex.candidates`, of the rows found."""
+        """As :meth:`SearchIndex.candidates`, of the rows found."""
         near, row = self.search(query, min(k + 1, len(self.rows)))
         zero = torch.zeros(len(query), dtype=torch.float64)
         found = Candidates(-square_distance(near, self.metric) / 2, row, zero, zero)
-        return found._replace(error=rounding(found, self.metric, query.shape[-1]))
+        return rounded(found, self.metric, query.shape[-1])
 
     def order(self, found: Candidates, query: Tensor, k: int) -> tuple[Tensor, Tensor]:
-        """As :meth:`ScanIndex.order`."""
         near, row, _ = ordered(found, query.double(), self.rows, self.metric, k)
         return near, row
 

@@ -2,43 +2,18 @@
 
 from __future__ import annotations
 
-from typing import Protocol
-
 from torch import Tensor
 
 from torchrl_rad.retrieval.approximate import FaissIndex
-from torchrl_rad.retrieval.choice import Candidates, Metric
+from torchrl_rad.retrieval.choice import Metric
+from torchrl_rad.retrieval.index import SearchIndex
 from torchrl_rad.retrieval.lists import ListIndex
 from torchrl_rad.retrieval.search import ScanIndex, TreeIndex
 
-__all__ = ["BACKENDS", "SearchIndex", "build_index"]
+__all__ = ["BACKENDS", "build_index"]
 
 BACKENDS = ("auto", "scan", "tree", "faiss")
 TREE_DIMS = 3  # beyond, a scan of k in the hundreds is faster
-
-
-class SearchIndex(Protocol):
-    """Rows that can be searched."""
-
-    rows: Tensor
-    metric: Metric
-
-    def search(self, query: Tensor, k: int) -> tuple[Tensor, Tensor]:
-        """The k most similar rows of each query, ties by the lower row.
-
-        Args:
-            query (Tensor): [Q, D], finite.
-            k (int): at most the number of rows.
-
-        Returns:
-            Similarities, float64 [Q, k], falling, and row numbers, int64 [Q, k].
-        """
-
-    def candidates(self, query: Tensor, k: int) -> Candidates:
-        """Rows among which the k most similar ones are, without their exact order."""
-
-    def order(self, found: Candidates, query: Tensor, k: int) -> tuple[Tensor, Tensor]:
-        """The answer of :meth:`search` from that of :meth:`candidates`."""
 
 
 def build_index(rows: Tensor, metric: Metric, backend: str, k: int) -> SearchIndex:

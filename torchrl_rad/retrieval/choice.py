@@ -13,9 +13,11 @@ __all__ = [
     "Candidates",
     "Metric",
     "choose",
+    "first_by_rank",
     "most_similar",
     "ordered",
-    "rounding",
+    "ranked",
+    "rounded",
     "similarity",
     "square_distance",
 ]
@@ -111,12 +113,16 @@ def ordered(
         Similarity, float64 [Q, k], falling; row, int64 [Q, k]; and the score, float64 [Q], that a
         row as similar as the last one has at least: where a candidate lies below, none is missing.
     """
-    near = rows.index_select(0, found.row.flatten()).view(*found.row.shape, rows.shape[-1])
-    near, index = most_similar(similarity(query[:, None], near, metric), found.row)
-    near, index = near[:, :k], index[:, :k]
+    near, index = (column[:, :k] for column in ranked(found.row, query, rows, metric))
     if found.row.shape[1] == len(rows):
         return near, index, torch.full_like(found.base, torch.inf)
     return near, index, found.base - square_distance(near[:, -1], metric) / 2 - found.error
+
+
+def ranked(row: Tensor, query: Tensor, rows: Tensor, metric: Metric) -> tuple[Tensor, Tensor]:
+    """Some rows [Q, C] of each query [Q, D] as :func:`most_similar` has them."""
+    states = rows.index_select(0, row.flatten()).view(*row.shape, rows.shape[-1])
+    return most_similar(similarity(query[:, None], states, metric), row)
 
 
 def most_similar(near: Tensor, index: Tensor) -> tuple[Tensor, Tensor]:
@@ -131,13 +137,30 @@ def most_similar(near: Tensor, index: Tensor) -> tuple[Tensor, Tensor]:
     return near, index
 
 
-def rounding(found: Candidates, metric: Metric, dims: int) -> Tensor:
-    """How different the scores of rows can be that are equally similar, [Q]."""
+def rounded(found: Candidates, metric: Metric, dims: int) -> Candidates:
+    """The same with the error that comes from similarities being rounded, besides its own."""
     fine = 2 * (dims + 4) * torch.finfo(torch.float64).eps
     if metric == "cosine":
-        return torch.full_like(found.base, 4 * fine)
+        return found._replace(error=found.error + 4 * fine)
     farthest = (2 * (found.base - found.score[:, -1])).clamp_min(0.0).sqrt()
-    return fine * (1 + farthest).square()
+    return found._replace(error=found.error + fine * (1 + farthest).square())
+
+
+def first_by_rank(rank: Tensor, rows: Tensor, valid: Tensor) -> Tensor:
+    """Place, int64 [Q, 1], of the first row of the highest rank among the valid ones.
+
+    Args:
+        rank (Tensor): int [N], not negative, of each row.
+        rows (Tensor): int64 [Q, C].
+        valid (Tensor): bool [Q, C]; where none is, the place is 0.
+
+    Examples:
+        >>> rows, valid = torch.tensor([[2, 0, 1]]), torch.tensor([[True, True, False]])
+        >>> first_by_rank(torch.tensor([5, 9, 5]), rows, valid)
+        tensor([[0]])
+    """
+    ranks = rank.index_select(0, rows.flatten()).view(rows.shape)
+    return torch.where(valid, ranks, -1).argmax(-1, keepdim=True)
 
 
 def choose(

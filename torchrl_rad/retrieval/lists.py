@@ -7,7 +7,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torchrl_rad.retrieval.choice import Candidates, ordered, rounding
+from torchrl_rad.retrieval.choice import Candidates, ordered, rounded
+from torchrl_rad.retrieval.index import SearchIndex
 from torchrl_rad.retrieval.search import ScanIndex
 
 __all__ = ["ListIndex"]
@@ -43,7 +44,7 @@ class Lists(NamedTuple):
     served: Tensor
 
 
-class ListIndex:
+class ListIndex(SearchIndex):
     """Exact neighbours by :class:`ScanIndex`, or from what it found for the query before.
 
     Query i of a batch is taken to follow query i of the batch before, as the rows of an environment
@@ -72,12 +73,7 @@ class ListIndex:
         self.searches = 0  # of all rows, for each query
         self.pause = self.waited = 0
 
-    def search(self, query: Tensor, k: int) -> tuple[Tensor, Tensor]:
-        """As :meth:`ScanIndex.search`."""
-        return self.order(self.candidates(query, k), query, k)
-
     def order(self, found: Candidates, query: Tensor, k: int) -> tuple[Tensor, Tensor]:
-        """As :meth:`ScanIndex.order`."""
         query = query.double()
         near, index, least = ordered(found, query, self.rows, self.metric, k)
         doubt = ~(found.score[:, -1] < least)
@@ -86,7 +82,6 @@ class ListIndex:
         return near, index
 
     def candidates(self, query: Tensor, k: int) -> Candidates:
-        """As :meth:`ScanIndex.candidates`."""
         query, kept = query.double(), self.scan.kept(k)
         longest = min(LIST_ENTRIES // max(1, query.numel()), len(self.rows) // SHARE)
         if longest < max(kept, ENOUGH * k) or len(query) == 0 or self.waited < self.pause:
@@ -164,4 +159,4 @@ class ListIndex:
         score, place = score.topk(kept, dim=-1)
         row = lists.row.gather(-1, place)
         found = Candidates(score.double(), row, error, moved.square() / 2)
-        return found._replace(error=error + rounding(found, self.metric, point.shape[-1]))
+        return rounded(found, self.metric, point.shape[-1])

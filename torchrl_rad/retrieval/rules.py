@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import torch
 from torch import Tensor
 
@@ -10,42 +12,18 @@ from torchrl_rad.retrieval.windows import WindowMax
 __all__ = ["RankedRule", "TolerantRule", "followed_rule", "highest_rule"]
 
 
-class RankedRule:
-    """Follows the neighbour of the highest rank; of equals the first, which is more similar.
+class RankedRule(NamedTuple):
+    """Follows the neighbour of the highest rank; of equals the more similar one.
 
     Where a row leads and how good that is do not depend on the query, so that both are columns.
 
-    Args:
-        rank (Tensor): int64 [N], not negative.
-        target (Tensor): int64 [N], the row to go for from each row.
-
-    Examples:
-        >>> rule = RankedRule(torch.tensor([0, 5, 5]), torch.tensor([0, 2, 2]))
-        >>> target, place = rule(torch.tensor([[0, 2, 1]]), torch.tensor([[True, True, True]]))
-        >>> target, place
-        (tensor([2]), tensor([[1]]))
+    Attributes:
+        rank: int [N], not negative.
+        target: int64 [N], the row to go for from each row.
     """
 
-    def __init__(self, rank: Tensor, target: Tensor):
-        small = len(rank) < 2**31  # half as much memory to read for each query
-        self.rank = rank.to(torch.int32) if small else rank
-        self.target = target
-
-    def __call__(self, rows: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
-        """Chooses a row for each query.
-
-        Args:
-            rows (Tensor): int64 [Q, k], neighbours, most similar first.
-            valid (Tensor): bool [Q, k], which of them are neighbours; at least one.
-
-        Returns:
-            The row to go for, int64 [Q], and the place of its neighbour in ``rows``, int64 [Q, 1].
-            Without any neighbour: some row and place 0.
-        """
-        rank = self.rank.index_select(0, rows.reshape(-1)).view(rows.shape)
-        place = rank.masked_fill_(~valid, -1).argmax(-1, keepdim=True)
-        row = rows.gather(-1, place).squeeze(-1)
-        return self.target.index_select(0, row), place
+    rank: Tensor
+    target: Tensor
 
 
 class TolerantRule:
@@ -77,7 +55,16 @@ class TolerantRule:
         self.peak = self.table.max(self.low, self.high)
 
     def __call__(self, rows: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
-        """As :meth:`RankedRule.__call__`."""
+        """Chooses a row for each query.
+
+        Args:
+            rows (Tensor): int64 [Q, k], neighbours, most similar first.
+            valid (Tensor): bool [Q, k], which of them are neighbours; at least one.
+
+        Returns:
+            The row to go for, int64 [Q], and the place of its neighbour in ``rows``, int64 [Q, 1].
+            Without any neighbour: some row and place 0.
+        """
         peak = torch.where(valid, self.peak[rows], -torch.inf)
         top = peak.amax(-1, keepdim=True)
         # float64: the difference of two float32 would be rounded
@@ -107,7 +94,7 @@ def followed_rule(values: Tensor, remaining: Tensor, ahead: int) -> RankedRule:
     table = WindowMax(values, ahead + 1)
     low, high = _window(remaining, 0, ahead)
     target = table.first(low, high, table.max(low, high), 0.0)
-    return RankedRule(values.unique(return_inverse=True)[1], target)
+    return RankedRule(_narrow(values.unique(return_inverse=True)[1]), target)
 
 
 def highest_rule(
@@ -130,7 +117,12 @@ def highest_rule(
     order = order[values[rows[order]].sort(stable=True).indices]
     rank = torch.empty_like(order)
     rank[order] = torch.arange(len(rows), device=rows.device)
-    return RankedRule(rank[place], target)
+    return RankedRule(_narrow(rank[place]), target)
+
+
+def _narrow(rank: Tensor) -> Tensor:
+    # half as much memory to read for each query
+    return rank.to(torch.int32) if len(rank) < 2**31 else rank
 
 
 def _window(remaining: Tensor, least: int, most: int) -> tuple[Tensor, Tensor]:

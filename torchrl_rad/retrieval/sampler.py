@@ -11,8 +11,9 @@ from torch import Tensor
 from torchrl.data.replay_buffers.samplers import Sampler
 
 from torchrl_rad.retrieval import search
-from torchrl_rad.retrieval.backends import BACKENDS, SearchIndex, build_index
-from torchrl_rad.retrieval.choice import Candidates, Metric, choose, similarity
+from torchrl_rad.retrieval.backends import BACKENDS, build_index
+from torchrl_rad.retrieval.choice import Candidates, Metric, choose, first_by_rank, similarity
+from torchrl_rad.retrieval.index import SearchIndex
 
 __all__ = ["RetrievalSampler", "storage_revision"]
 
@@ -202,8 +203,7 @@ class RetrievalSampler(Sampler):
             again = Candidates(*(part[doubt] for part in found))
             nears, rows = index.order(again, query[doubt], k)
             valid = nears >= self.threshold
-            # the first place of the largest: rows come by similarity
-            place = torch.where(valid, rank[rows], -1).argmax(-1, keepdim=True)
+            place = first_by_rank(rank, rows, valid)
             near[doubt] = nears.gather(-1, place)[:, 0]
             row[doubt], hit[doubt] = rows.gather(-1, place)[:, 0], valid[:, 0]
         return row, near, hit
@@ -253,10 +253,8 @@ class RetrievalSampler(Sampler):
                 deviation = torch.where(varies, rows.std(0, correction=0), 1.0)
                 self._scale = (rows.mean(0), deviation)
                 rows = self._prepare(states)
-            self._index, self._revision = (
-                build_index(rows, self.metric, self.backend, self.k),
-                revision,
-            )
+            self._index = build_index(rows, self.metric, self.backend, self.k)
+            self._revision = revision
         return self._index
 
     def invalidate(self) -> None:

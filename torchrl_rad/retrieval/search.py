@@ -12,9 +12,11 @@ from torchrl_rad.retrieval.choice import (
     Metric,
     most_similar,
     ordered,
-    rounding,
+    ranked,
+    rounded,
     similarity,
 )
+from torchrl_rad.retrieval.index import SearchIndex
 
 __all__ = ["ScanIndex", "TreeIndex"]
 
@@ -23,7 +25,7 @@ SPARE = 32  # rows ranked beyond k, at least
 TINY, HUGE = 1e-15, 1e15  # sizes whose squares float32 holds
 
 
-class ScanIndex:
+class ScanIndex(SearchIndex):
     """Compares a query with every row, in one matrix product a chunk; never holds queries x rows.
 
     The product is taken in float32 and gives each row a score with a known largest error. The best
@@ -54,21 +56,7 @@ class ScanIndex:
         self.offset = -size.square() / 2 if metric == "euclidean" else 1.0 / size
         self.offset = self.offset.to(self.factors)
 
-    def search(self, query: Tensor, k: int) -> tuple[Tensor, Tensor]:
-        """The k most similar rows of each query.
-
-        Args:
-            query (Tensor): [Q, D], finite.
-            k (int): at most the number of rows.
-
-        Returns:
-            Similarities, float64 [Q, k], falling, and row numbers, int64 [Q, k]; ties by the lower
-            row.
-        """
-        return self.order(self.candidates(query, k), query, k)
-
     def order(self, found: Candidates, query: Tensor, k: int) -> tuple[Tensor, Tensor]:
-        """The answer of :meth:`search` from that of :meth:`candidates`."""
         query = query.double()
         near, index, least = ordered(found, query, self.rows, self.metric, k)
         for row in (~(found.score[:, -1] < least)).nonzero().flatten().tolist():  # ties, mostly
@@ -76,13 +64,12 @@ class ScanIndex:
         return near, index
 
     def candidates(self, query: Tensor, k: int) -> Candidates:
-        """Rows among which the k most similar ones are; ``query`` as in :meth:`search`."""
         query = query.double()
         score, index = self.best(query, self.kept(k))
         square = query.square().sum(-1)
         base = square / 2 if self.metric == "euclidean" else torch.ones_like(square)
         found = Candidates(score.double(), index, self.error(query), base)
-        return found._replace(error=found.error + rounding(found, self.metric, query.shape[-1]))
+        return rounded(found, self.metric, query.shape[-1])
 
     def kept(self, k: int) -> int:
         """How many candidates there are for k neighbours."""
@@ -138,7 +125,7 @@ class ScanIndex:
         return near[0, :k], index[0, :k]
 
 
-class TreeIndex:
+class TreeIndex(SearchIndex):
     """scipy's k-d tree for a few dims, with Euclidean similarity.
 
     Its answers are ranked anew, so that ties fall as in a scan.
@@ -160,19 +147,11 @@ class TreeIndex:
             self.rows.numpy(), leafsize=32, balanced_tree=False, compact_nodes=False
         )
 
-    def search(self, query: Tensor, k: int) -> tuple[Tensor, Tensor]:
-        """As :meth:`ScanIndex.search`."""
-        return self.order(self.candidates(query, k), query, k)
-
     def order(self, found: Candidates, query: Tensor, k: int) -> tuple[Tensor, Tensor]:
-        """As :meth:`ScanIndex.order`."""
         if found.score[:, -1:].isinf().any():  # too far for the tree, which then finds nothing
             return ScanIndex(self.rows, self.metric).search(query, k)
         query = query.double()
-        near = self.rows.index_select(0, found.row.flatten()).view(
-            *found.row.shape, query.shape[-1]
-        )
-        near, index = most_similar(similarity(query[:, None], near, self.metric), found.row)
+        near, index = ranked(found.row, query, self.rows, self.metric)
         if index.shape[1] > k:
             # the tree is free in what it takes among rows as far as the last one: look around
             tied = near[:, k] >= near[:, k - 1] * (1 - 1e-12)
@@ -182,7 +161,6 @@ class TreeIndex:
         return near[:, :k], index[:, :k]
 
     def candidates(self, query: Tensor, k: int) -> Candidates:
-        """As :meth:`ScanIndex.candidates`."""
         query, wanted = query.double(), min(k + 1, len(self.rows))
         distance, row = self.tree.query(query.numpy(), k=wanted)
         distance, row = distance.reshape(len(query), wanted), row.reshape(len(query), wanted)
