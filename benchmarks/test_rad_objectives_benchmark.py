@@ -26,7 +26,8 @@ from torchrl_rad import (
     draw_step_pairs,
     inverse_dynamics_actor,
 )
-from torchrl_rad.training import Objective, uses_bf16
+from torchrl_rad.precision import uses_bf16
+from torchrl_rad.training import Objective
 
 THREADS = 1
 VERSIONS = {name: version(name) for name in ("torch", "torchrl", "tensordict", "torchrl_rad")}

@@ -17,7 +17,7 @@ from torchrl.modules import DiffusionActor
 
 from torchrl_rad import ExpertDatabase, RetrievalSampler
 from torchrl_rad.policy import build_policy, fit_scales
-from torchrl_rad.training import uses_bf16
+from torchrl_rad.precision import planning_dtype
 
 THREADS = 1
 VERSIONS = {name: version(name) for name in ("torch", "torchrl", "tensordict", "torchrl_rad")}
@@ -84,9 +84,10 @@ def databases():
 
 def lowered(precision: str) -> torch.autocast:
     """What a plan is made under."""
-    if precision == "bf16" and not uses_bf16("auto", DEVICE):
-        pytest.skip("products of bfloat16 matrices are not faster on this device")
-    return torch.autocast(DEVICE.type, torch.bfloat16, precision == "bf16")
+    dtype = {"fp32": None, "bf16": torch.bfloat16, "fp16": torch.float16}[precision]
+    if dtype not in (None, planning_dtype("auto", DEVICE)):
+        pytest.skip(f"plans are not made faster by {dtype} on this device")
+    return torch.autocast(DEVICE.type, dtype, dtype is not None)
 
 
 def make_policy(database, size, rule="highest", target=True, **planner):
@@ -217,7 +218,7 @@ def measure_plan(benchmark, database, size, process, candidates, batch, precisio
 
 batches = pytest.mark.parametrize("batch", [1, 50], ids="b{}".format)
 processes = pytest.mark.parametrize("process", ["flow", "diffusion"])
-precisions = pytest.mark.parametrize("precision", ["fp32", "bf16"])
+precisions = pytest.mark.parametrize("precision", ["fp32", "bf16", "fp16"])
 # 50 environments with 64 candidates each take long at the larger sizes
 ASKED = [
     pytest.param(size, candidates, batch, id=f"{size}-c{candidates}-b{batch}")

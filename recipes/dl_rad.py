@@ -40,9 +40,10 @@ from torchrl_rad.experiment import (
 )
 from torchrl_rad.plots import plot_curves, plot_targets
 from torchrl_rad.policy import save_policy
+from torchrl_rad.precision import uses_bf16
 from torchrl_rad.results import format_table, score_source
 from torchrl_rad.runs import RunFolder
-from torchrl_rad.training import Interrupted, Objective, train, uses_bf16
+from torchrl_rad.training import Interrupted, Objective, train
 
 torchrl_logger.setLevel(logging.WARNING)
 warnings.filterwarnings("ignore", "The name target_actor_network_params")  # of TorchRL's BCLoss

@@ -16,8 +16,8 @@ from torchrl_rad import make_maze_env, maze_task
 from torchrl_rad.checkpoint import CheckpointError, read_json
 from torchrl_rad.experiment import collect_episodes, policy_row
 from torchrl_rad.policy import load_policy
+from torchrl_rad.precision import planning_dtype
 from torchrl_rad.results import format_table, score_source
-from torchrl_rad.training import uses_bf16
 
 torchrl_logger.setLevel(logging.WARNING)
 
@@ -29,7 +29,7 @@ def main() -> None:
     parser.add_argument("--episodes", type=int, default=100, help="rows, one episode each")
     parser.add_argument("--seed", type=int, default=10_000, help="of start states and noise")
     parser.add_argument("--threads", type=int, default=2)
-    parser.add_argument("--precision", default="auto", choices=("auto", "bf16", "fp32"))
+    parser.add_argument("--precision", default="auto", choices=("auto", "bf16", "fp16", "fp32"))
     arguments = parser.parse_args()
     torch.set_num_threads(arguments.threads)
     try:
@@ -40,8 +40,8 @@ def main() -> None:
     except (CheckpointError, FileNotFoundError, KeyError, ValueError) as error:
         sys.exit(f"error: {error.args[0] if isinstance(error, KeyError) else error}")
     env = make_maze_env(task, arguments.episodes)
-    bf16 = uses_bf16(arguments.precision)
-    steps = collect_episodes(env, policy, task.max_steps, arguments.seed, task.name, bf16)
+    dtype = planning_dtype(arguments.precision)
+    steps = collect_episodes(env, policy, task.max_steps, arguments.seed, task.name, dtype)
     print(format_table({task.name: policy_row(task, policy, steps)}))
     print(f"\n{score_source(task)}")
 

@@ -17,7 +17,7 @@ from torchrl.objectives.common import LossModule
 from torchrl_rad import Normalizer, StepEstimationLoss, StepEstimator, draw_step_pairs
 from torchrl_rad.checkpoint import Checkpointer, CheckpointError
 from torchrl_rad.runs import MetricsLog
-from torchrl_rad.training import CLIP, Interrupted, Meter, Objective, train, uses_bf16
+from torchrl_rad.training import CLIP, Interrupted, Meter, Objective, train
 
 STEPS, SAVE, LOG = 9, 3, 2
 META = {"task": "toy", "normalizer": "ab12"}
@@ -479,31 +479,6 @@ def test_autocast(bf16):
     assert seen == [(bf16, torch.bfloat16 if bf16 else torch.float32)]
     assert not torch.is_autocast_enabled("cpu")
     assert all(p.dtype == torch.float32 for p in objective.loss.parameters())
-
-
-@pytest.mark.parametrize("amx", [False, True])
-def test_bf16_where_it_is_faster(monkeypatch, amx):
-    monkeypatch.setattr(torch.cpu, "_is_amx_tile_supported", lambda: amx, raising=False)
-    assert uses_bf16("auto") is amx
-    assert uses_bf16("auto", torch.device("cpu")) is amx
-    assert uses_bf16("bf16") is True
-    assert uses_bf16("fp32") is False
-
-
-@pytest.mark.parametrize("supported", [False, True])
-def test_bf16_on_cuda(monkeypatch, supported):
-    monkeypatch.setattr(torch.cuda, "is_bf16_supported", lambda: supported)
-    assert uses_bf16("auto", "cuda:0") is supported
-
-
-def test_unknown_processor_trains_in_float32(monkeypatch):
-    monkeypatch.delattr(torch.cpu, "_is_amx_tile_supported", raising=False)
-    assert uses_bf16("auto") is False
-
-
-def test_unknown_precision():
-    with pytest.raises(ValueError, match="precision is 'fp8'; expected 'auto', 'bf16' or 'fp32'"):
-        uses_bf16("fp8")
 
 
 if __name__ == "__main__":

@@ -25,10 +25,10 @@ from torchrl_rad.envs.maze import FixedGoalMaze, MazeTask, make_maze_env, maze_t
 from torchrl_rad.evaluation import episode_results, evaluate, measure_latency, summarise
 from torchrl_rad.objectives.step import draw_step_pairs
 from torchrl_rad.policy import build_policy, fit_scales
+from torchrl_rad.precision import planning_dtype
 from torchrl_rad.results import score_source, write_results
 from torchrl_rad.retrieval import RetrievalSampler
 from torchrl_rad.runs import RunFolder, environment_facts
-from torchrl_rad.training import uses_bf16
 
 __all__ = [
     "BACKBONE",
@@ -187,7 +187,7 @@ def collect_episodes(
     max_steps: int,
     seed: int,
     name: str = "policy",
-    bf16: bool = False,
+    dtype: torch.dtype | None = None,
     progress: bool = True,
 ) -> TensorDictBase:
     """The first episode of each row of an environment; same seed, same episodes.
@@ -198,7 +198,8 @@ def collect_episodes(
         max_steps (int): limit of an episode.
         seed (int): of the start states and of the policy's noise.
         name (str, optional): shown beside the progress bar.
-        bf16 (bool, optional): plan under bfloat16 autocast. Defaults to ``False``.
+        dtype (torch.dtype, optional): of autocast, as of
+            :func:`~torchrl_rad.precision.planning_dtype`. Defaults to float32.
         progress (bool, optional): show a bar. Defaults to ``True``.
 
     Returns:
@@ -207,7 +208,7 @@ def collect_episodes(
     device = next(policy.parameters()).device
 
     def act(tensordict: TensorDictBase) -> TensorDictBase:
-        with torch.autocast(device.type, torch.bfloat16, bf16):
+        with torch.autocast(device.type, dtype, dtype is not None):
             return policy(tensordict.to(device)).to("cpu")  # where the mazes are
 
     env.set_seed(seed)
@@ -270,9 +271,9 @@ def evaluate_policies(
         if steps is None:
             seed = settings["seed"] + cfg["seed"]
             env = make_maze_env(task, settings["episodes"]) if env is None else env
-            bf16 = uses_bf16(cfg["optim"]["precision"], cfg["device"])
+            dtype = planning_dtype(cfg["optim"]["precision"], cfg["device"])
             steps = collect_episodes(
-                env, parts.policy, task.max_steps, seed, name, bf16, progress=progress
+                env, parts.policy, task.max_steps, seed, name, dtype, progress=progress
             )
             run.save_episodes(name, steps)
         episodes[name] = steps

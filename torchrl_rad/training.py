@@ -21,7 +21,7 @@ from tqdm import tqdm
 
 from torchrl_rad.checkpoint import Checkpointer
 
-__all__ = ["Interrupted", "Meter", "Objective", "train", "uses_bf16"]
+__all__ = ["Interrupted", "Meter", "Objective", "train"]
 
 CLIP = 1.0  # largest norm of a gradient
 
@@ -147,31 +147,6 @@ class Meter:
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         self.sums, self.count = dict(state["sums"]), state["count"]
-
-
-def uses_bf16(precision: str, device: str | torch.device = "cpu") -> bool:
-    """Whether to compute under bfloat16 autocast.
-
-    Args:
-        precision (str): ``"bf16"``, ``"fp32"``, or ``"auto"``: where products of bfloat16 matrices
-            are faster than of float32, which is on CUDA and on CPUs with AMX.
-        device (str, optional): Defaults to ``"cpu"``.
-
-    Raises:
-        ValueError: another precision.
-
-    Examples:
-        >>> uses_bf16("fp32"), uses_bf16("bf16")
-        (False, True)
-    """
-    if precision not in ("auto", "bf16", "fp32"):
-        raise ValueError(f"precision is {precision!r}; expected 'auto', 'bf16' or 'fp32'.")
-    if precision != "auto":
-        return precision == "bf16"
-    if torch.device(device).type == "cuda":
-        return torch.cuda.is_bf16_supported()
-    supported = getattr(torch.cpu, "_is_amx_tile_supported", None)  # not public, so it may go
-    return bool(supported and supported())
 
 
 def train(

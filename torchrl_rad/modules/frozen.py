@@ -17,6 +17,7 @@ __all__ = [
     "FrozenLinear",
     "PlainNetwork",
     "StepNetwork",
+    "can_pack",
     "is_hooked",
     "step_network",
 ]
@@ -85,7 +86,8 @@ class FrozenLinear:
     """A linear layer whose weights lie as the product wants to read them.
 
     With few rows a product takes as long as reading the weights does. In float32 they are
-    transposed; in bfloat16 on a CPU they are packed by oneDNN, as inductor's frozen graphs are.
+    transposed; on a CPU those of lower precision are packed: in bfloat16 by oneDNN, as inductor's
+    frozen graphs are, in float16 by fbgemm, whose products take rows and add up in float32.
 
     Args:
         weight (Tensor): [out, in].
@@ -99,32 +101,58 @@ class FrozenLinear:
     """
 
     def __init__(self, weight: Tensor, bias: Tensor, dtype: torch.dtype | None = None):
-        self.dtype = dtype = weight.dtype if dtype is None else dtype
-        weight, self.bias = weight.detach().to(dtype), bias.detach().to(dtype)
-        self.product = _packed_product() if weight.is_cpu and dtype is torch.bfloat16 else None
-        if self.product is not None:
-            self.weight = torch.ops.mkldnn._reorder_linear_weight(weight.contiguous())
+        self.dtype = weight.dtype if dtype is None else dtype
+        weight, bias = weight.detach(), bias.detach()
+        self.packed = None
+        if weight.is_cpu and can_pack(self.dtype):
+            self.packed = _PACKED[self.dtype](weight, bias)
         else:  # on a GPU the transposed view is read as fast
+            weight, self.bias = weight.to(self.dtype), bias.to(self.dtype)
             self.weight = weight.T.contiguous() if weight.is_cpu else weight.T
 
     def __call__(self, x: Tensor, gelu: bool = False) -> Tensor:
         """[M, out] of rows [M, in], through GELU if asked for."""
-        x = x.to(self.dtype)
-        if self.product is not None:
-            name, form = ("gelu", "none") if gelu else ("none", "")
-            return self.product(x, self.weight, self.bias, name, [], form)
-        x = torch.addmm(self.bias, x, self.weight)
+        if self.packed is not None:
+            return self.packed(x, gelu)
+        x = torch.addmm(self.bias, x.to(self.dtype), self.weight)
         return F.gelu(x) if gelu else x
 
 
-def _packed_product() -> Callable[..., Tensor] | None:
-    """OneDNN's product of bfloat16 rows and a packed matrix, where this machine has it."""
+def can_pack(dtype: torch.dtype) -> bool:
+    """Whether this CPU has a product with packed weights of a dtype."""
     try:  # these are not public, so they may go
-        if torch.ops.mkldnn._is_mkldnn_bf16_supported():
-            return torch.ops.mkldnn._linear_pointwise.default
+        if dtype is torch.bfloat16:
+            return torch.ops.mkldnn._is_mkldnn_bf16_supported()
+        if dtype is torch.float16:
+            torch.ops.quantized.linear_prepack_fp16  # noqa: B018
+            return torch.backends.quantized.engine in ("x86", "fbgemm")
     except AttributeError:
         pass
-    return None
+    return False
+
+
+def _packed_bfloat16(weight: Tensor, bias: Tensor) -> Callable[[Tensor, bool], Tensor]:
+    dtype, bias = torch.bfloat16, bias.bfloat16()
+    weight = torch.ops.mkldnn._reorder_linear_weight(weight.to(dtype).contiguous())
+
+    def product(x: Tensor, gelu: bool) -> Tensor:
+        name, form = ("gelu", "none") if gelu else ("none", "")
+        return torch.ops.mkldnn._linear_pointwise(x.to(dtype), weight, bias, name, [], form)
+
+    return product
+
+
+def _packed_float16(weight: Tensor, bias: Tensor) -> Callable[[Tensor, bool], Tensor]:
+    packed = torch.ops.quantized.linear_prepack_fp16(weight.float().contiguous(), bias.float())
+
+    def product(x: Tensor, gelu: bool) -> Tensor:
+        x = torch.ops.quantized.linear_dynamic_fp16(x.float(), packed)
+        return F.gelu(x) if gelu else x
+
+    return product
+
+
+_PACKED = {torch.bfloat16: _packed_bfloat16, torch.float16: _packed_float16}
 
 
 class FrozenBlock:
@@ -163,8 +191,9 @@ class FrozenBlock:
 class FrozenDiT:
     """A :class:`~torchrl_rad.modules.dit.DiT` at its present weights and the times of a sampler.
 
-    Its predictions are those of the network: in float32 but for the order of summation, in bfloat16
-    products of matrices are rounded (the residual stream, attention, embedding and head are not).
+    Its predictions are those of the network: in float32 but for the order of summation; in float16
+    on a CPU weights are rounded, in bfloat16 also what they are multiplied with (the residual
+    stream, attention, embedding and head are not).
 
     Args:
         network (DiT): copied; later changes of its weights do not show.
@@ -228,8 +257,6 @@ class FrozenCache:
     """
 
     def __init__(self) -> None:
-        self.modules: list[nn.Module] = []
-        self.places: list[tuple[nn.Module, str]] = []
         self.state: list[tuple[int, int, int]] = []
         self.samples: list[Tensor] = []
         self.before = torch.empty(0)
@@ -241,11 +268,8 @@ class FrozenCache:
     @torch.no_grad()
     def get(self, module: nn.Module, key: Hashable, make: Callable[[], Any]) -> Any:
         """What ``make()`` gave for ``key`` at the module's present weights."""
-        modules = list(module.modules())
-        if modules != self.modules:
-            self.modules = modules
-            self.places = [(m, name) for m in modules for name in m._parameters]
-        parameters = [p for m, name in self.places if (p := getattr(m, name)) is not None]
+        modules = module.modules()
+        parameters = [p for m in modules for p in m._parameters.values() if p is not None]
         state = [(id(p), p.data_ptr(), p._version) for p in parameters]
         same = state == self.state
         if not same:

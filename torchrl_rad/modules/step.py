@@ -116,7 +116,9 @@ class StepEstimator(TensorDictModuleBase):
             # a state with NaN has itself, without them, as its target
             state = self.normalizer.read(tensordict, self.in_keys[0])
             state = torch.nan_to_num(state, nan=0.0, posinf=0.0, neginf=0.0)
-            logits = self.logits(state, self.normalizer.read(tensordict, self.in_keys[1]))
+            target = self.normalizer.read(tensordict, self.in_keys[1])
+            with torch.autocast(state.device.type, enabled=False):  # too small to be faster
+                logits = self.logits(state, target)
             if not recorded:
                 tensordict.set(self.out_keys[0], self._paced(self._steps(logits)))
             if len(self.out_keys) > 1:
