@@ -10,6 +10,8 @@ from torchrl_rad.retrieval.lists import LONGEST_PAUSE, ListIndex
 
 from ..oracle import ranking
 
+pytestmark = pytest.mark.usefixtures("compared_in")
+
 METRICS = ["euclidean", "cosine"]
 
 

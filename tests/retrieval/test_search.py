@@ -12,6 +12,8 @@ from torchrl_rad.retrieval.lists import ListIndex
 
 from ..oracle import ranking
 
+pytestmark = pytest.mark.usefixtures("compared_in")
+
 BACKENDS = [("scan", "euclidean"), ("scan", "cosine"), ("tree", "euclidean")]
 both = pytest.mark.parametrize("backend, metric", BACKENDS)
 
@@ -97,7 +99,8 @@ def test_scan_beyond_the_range_of_float32(metric, scale):
         assert_exact(ScanIndex(one, metric), query, one, metric, 5)
 
 
-def test_scan_copies_no_rows():
+def test_scan_copies_no_rows(monkeypatch):
+    monkeypatch.setattr(search, "FEW_ENTRIES", 0)
     rows = torch.randn(20, 3)
     for metric in ("euclidean", "cosine"):
         assert ScanIndex(rows, metric).factors.data_ptr() == rows.data_ptr()

@@ -21,6 +21,7 @@ from torchrl_rad.retrieval.index import SearchIndex
 __all__ = ["ScanIndex", "TreeIndex"]
 
 SCAN_ENTRIES = 2**20  # scores, or entries of states, that a search holds at a time
+FEW_ENTRIES = 2**20  # of states: so few are compared in float64, which leaves no doubt
 SPARE = 32  # rows ranked beyond k, at least
 TINY, HUGE = 1e-15, 1e15  # sizes whose squares float32 holds
 
@@ -28,9 +29,10 @@ TINY, HUGE = 1e-15, 1e15  # sizes whose squares float32 holds
 class ScanIndex(SearchIndex):
     """Compares a query with every row, in one matrix product a chunk; never holds queries x rows.
 
-    The product is taken in float32 and gives each row a score with a known largest error. The best
-    scores are ranked anew in float64; that no other row can be among the k follows from the error,
-    and where it does not, all rows that could be are ranked. So answers are exact.
+    The product is taken in float32, of few rows in float64, and gives each row a score with a known
+    largest error. The best scores are ranked anew in float64; that no other row can be among the k
+    follows from the error, and where it does not, all rows that could be are ranked. So answers are
+    exact.
 
     Args:
         rows (Tensor): [N, D].
@@ -52,6 +54,7 @@ class ScanIndex(SearchIndex):
         self.largest = float(size.max()) if len(rows) else 0.0
         # beyond, squares leave the range of float32
         narrow = bool(((size == 0) | ((size > TINY) & (size < HUGE))).all()) and self.largest > 0
+        narrow &= rows.numel() > FEW_ENTRIES
         self.factors = rows.float() if narrow else rows.double()  # no copy of float32 rows
         self.offset = -size.square() / 2 if metric == "euclidean" else 1.0 / size
         self.offset = self.offset.to(self.factors)
