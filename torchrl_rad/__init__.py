@@ -11,9 +11,9 @@ from torchrl_rad.modules import __all__ as _modules
 from torchrl_rad.objectives import *  # noqa: F403
 from torchrl_rad.objectives import __all__ as _objectives
 from torchrl_rad.policy import build_policy, load_policy, save_policy
+from torchrl_rad.precision import planning_dtype
 from torchrl_rad.retrieval import *  # noqa: F403
 from torchrl_rad.retrieval import __all__ as _retrieval
-from torchrl_rad.precision import planning_dtype
 from torchrl_rad.training import Objective, train
 
 __all__ = [
