@@ -105,3 +105,40 @@ def target_of(query, columns, search, rule, **limits):
     return {"target": columns["observation"][target], "found": True, "similarity": similar,
             "target_return": columns["return_to_go"][target], "target_index": target,
             "target_offset": target - anchor}  # fmt: skip
+
+
+def for_goal(columns, following, goal, radius, gamma, first_visit=False, expert=None):
+    """The columns that a database of the demonstrations for one goal would have.
+
+    Args:
+        columns: dict of lists: observation, episode.
+        following: the state after each row.
+        goal: list of floats, compared with the first entries.
+        radius: within which it is reached.
+        gamma: discount.
+        first_visit: an episode ends where the goal is reached.
+        expert: list of rewards of an episode -> bool; all that reach the goal are asked.
+
+    Returns:
+        Those of the episodes that are demonstrations, and the row of each in ``columns``.
+    """
+    out = {"observation": [], "episode": [], "return_to_go": [], "remaining": []}
+    rows = []
+    for episode in sorted(set(columns["episode"])):
+        own = [i for i, e in enumerate(columns["episode"]) if e == episode]
+        reward = [float(math.dist(following[i][: len(goal)], goal) <= radius) for i in own]
+        if not any(reward) or (expert is not None and not expert(reward)):
+            continue
+        ends = {len(own) - 1} | {t for t, r in enumerate(reward) if r and first_visit}
+        begin = 0
+        for end in sorted(ends):
+            for t in range(begin, end + 1):
+                rows.append(own[t])
+                out["observation"].append(columns["observation"][own[t]])
+                out["episode"].append((episode, begin))
+                out["return_to_go"].append(
+                    sum(gamma ** (u - t) * reward[u] for u in range(t, end + 1))
+                )
+                out["remaining"].append(end - t)
+            begin = end + 1
+    return out, rows

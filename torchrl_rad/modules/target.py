@@ -14,7 +14,9 @@ from torchrl.data.tensor_specs import Unbounded
 from torchrl.envs.transforms import TensorDictPrimer
 
 from torchrl_rad.data.database import ExpertDatabase
-from torchrl_rad.retrieval.rules import RankedRule, TolerantRule, followed_rule, highest_rule
+from torchrl_rad.retrieval.goal_rules import GoalRule
+from torchrl_rad.retrieval.goals import GoalReward, GoalTable
+from torchrl_rad.retrieval.rules import TargetRule, followed_rule, highest_rule
 
 __all__ = ["RetrievalTargetModule"]
 
@@ -26,8 +28,7 @@ KEPT = ("retrieval", "kept")  # float64 [*B, 4]: row, similarity, offset, age
 class _Columns(NamedTuple):
     source: object  # the search structure that they belong to
     states: Tensor
-    values: Tensor
-    rule: RankedRule | TolerantRule
+    rule: TargetRule
 
 
 class RetrievalTargetModule(TensorDictModuleBase):
@@ -44,6 +45,11 @@ class RetrievalTargetModule(TensorDictModuleBase):
       is the row with the largest return among it and the next ``ahead`` rows of its episode (ties:
       more steps left).
 
+    With ``goal_key`` each row of the batch has a goal of its own: neighbours are rows of episodes
+    that reach it, returns and ends of episodes those of :class:`~torchrl_rad.retrieval.GoalReward`,
+    computed from the recorded states; the database should hold all episodes then. A goal that no
+    recorded episode reaches gives no target.
+
     Rows of a batch are independent of each other. The database is neither a parameter nor a buffer:
     no weight synchronisation moves it, ``deepcopy`` shares it.
 
@@ -51,6 +57,7 @@ class RetrievalTargetModule(TensorDictModuleBase):
     key                 shape, dtype              meaning
     ==================  ========================  ==================================================
     ``observation``     [*B, S], read             state, raw units
+    ``goal_key``        [*B, G], read on demand   goal, in units of the state
     ``target``          [*B, S] of its dtype      recorded state, raw units; the observation itself
                                                   if none was found
     ``found``           [*B, 1] bool              False: no neighbour, NaN or Inf in the state,
@@ -77,6 +84,9 @@ class RetrievalTargetModule(TensorDictModuleBase):
             (``("retrieval", "kept")``), see :meth:`make_tensordict_primer`. Defaults to ``1``.
         min_offset (int, optional): smallest step ahead by ``"highest"``, as far as the episode
             goes. Defaults to ``0``.
+        goal_key (NestedKey, optional): the goal of each row. Defaults to none: returns are the
+            recorded ones.
+        goal_reward (GoalReward, optional): when a goal is reached. Defaults to within 0.5 of it.
         in_keys (sequence of NestedKey, optional): the state. Defaults to ``["observation"]``.
         out_keys (sequence of NestedKey, optional): new names, in the order of the table; a sixth
             one asks for the offset.
@@ -111,6 +121,8 @@ class RetrievalTargetModule(TensorDictModuleBase):
         ahead: int = 16,
         retrieval_interval: int = 1,
         min_offset: int = 0,
+        goal_key: NestedKey | None = None,
+        goal_reward: GoalReward | None = None,
         in_keys: Sequence[NestedKey] = ("observation",),
         out_keys: Sequence[NestedKey] = OUT_KEYS,
     ):
@@ -135,11 +147,19 @@ class RetrievalTargetModule(TensorDictModuleBase):
             raise ValueError(
                 f"expected one in_key and five or six out_keys, got {in_keys} and {out_keys}."
             )
+        if goal_key is not None and tolerance > 0:
+            raise ValueError(f"tolerance is {tolerance}; with a goal_key it must be 0.")
+        if goal_key is None and goal_reward is not None:
+            raise ValueError("goal_reward is given without a goal_key; pass both or neither.")
         # a handle, out of reach of parameters, buffers and state_dict
         self.__dict__["database"] = database
         self.horizon, self.rule, self.tolerance, self.ahead = horizon, rule, tolerance, ahead
         self.retrieval_interval, self.min_offset = retrieval_interval, min_offset
+        self.goal_key = goal_key
+        self.goal_reward = GoalReward() if goal_reward is None else goal_reward
         self.in_keys, self.out_keys = list(in_keys), list(out_keys)
+        if goal_key is not None:
+            self.in_keys.append(goal_key)
         self.named_out = list(out_keys)
         if retrieval_interval > 1:
             self.in_keys += ["is_init", KEPT]
@@ -151,8 +171,8 @@ class RetrievalTargetModule(TensorDictModuleBase):
         """Writes the target of each row into ``tensordict`` and returns it.
 
         Raises:
-            KeyError: the state is missing, or with ``retrieval_interval`` what is kept.
-            ValueError: the state has another width than those of the database.
+            KeyError: the state or the goal is missing, or with ``retrieval_interval`` what is kept.
+            ValueError: the state or the goal has another width than those of the database.
         """
         state = tensordict.get(self.in_keys[0])
         if state is None:
@@ -161,20 +181,37 @@ class RetrievalTargetModule(TensorDictModuleBase):
             )
         shape = state.shape[:-1]
         query = state.reshape(shape.numel(), state.shape[-1])
+        goals = None if self.goal_key is None else self._goals(tensordict, shape)
         with self.database.lock:  # rows chosen and rows read are of the same content
-            found = (
-                self._kept(tensordict, query) if self.retrieval_interval > 1 else self.select(query)
-            )
-            index, similarity, offset = found
+            if self.retrieval_interval > 1:
+                index, similarity, offset = self._kept(tensordict, query, goals)
+            else:
+                index, similarity, offset = self.select(query, goals)
             hit = index >= 0
-            target, value = self._read(query, index, hit)
+            target, value = self._read(query, goals, index, hit)
         results = (target, hit, similarity, value, index, offset)
         for key, result in zip(self.named_out, results, strict=False):
             width = target.shape[-1] if result is target else 1
             tensordict.set(key, result.reshape(*shape, width))
         return tensordict
 
-    def _read(self, query: Tensor, index: Tensor, hit: Tensor) -> tuple[Tensor, Tensor]:
+    def _goals(self, tensordict: TensorDictBase, shape: torch.Size) -> Tensor:
+        goals = tensordict.get(self.goal_key, None)
+        if goals is None:
+            raise KeyError(
+                f"{self.goal_key!r} is missing in the tensordict; RetrievalTargetModule reads the "
+                "goal of each row there."
+            )
+        if goals.shape[:-1] != shape:
+            raise ValueError(
+                f"goals are {list(goals.shape)}, states {[*shape, '...']}; expected a goal a row, "
+                f"{[*shape, 'G']}."
+            )
+        return goals.reshape(shape.numel(), goals.shape[-1])
+
+    def _read(
+        self, query: Tensor, goals: Tensor | None, index: Tensor, hit: Tensor
+    ) -> tuple[Tensor, Tensor]:
         """State [Q, S] and return [Q] of the rows chosen."""
         whole = bool(hit.all())
         if not whole:
@@ -185,7 +222,7 @@ class RetrievalTargetModule(TensorDictModuleBase):
         columns = self._prepare()
         place = index.to(columns.states.device)
         target = columns.states.index_select(0, place).to(query)
-        value = columns.values.index_select(0, place).to(query.device)
+        value = columns.rule.value(place, goals).to(query.device)
         if not whole:
             target = torch.where(hit[:, None], target, own)
             value = torch.where(hit, value, 0.0)
@@ -193,38 +230,30 @@ class RetrievalTargetModule(TensorDictModuleBase):
 
     # the rule
 
-    def select(self, query: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def select(self, query: Tensor, goals: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor]:
         """The rule itself.
 
         Args:
             query (Tensor): [Q, S], raw units.
+            goals (Tensor, optional): [Q, G], where there is a ``goal_key``.
 
         Returns:
             Row of the target (int64 [Q], -1 if none), similarity (float32 [Q]) and recorded offset
             (int64 [Q]).
         """
         if len(query) > QUERIES:
-            parts = [self.select(part) for part in query.split(QUERIES)]
+            many = [None] * len(query) if goals is None else goals.split(QUERIES)
+            parts = [self.select(*part) for part in zip(query.split(QUERIES), many, strict=False)]
             return tuple(torch.cat(column) for column in zip(*parts, strict=True))  # type: ignore
         database, device = self.database, query.device
         with database.lock:
             if len(database) == 0:
                 none = torch.full((len(query),), -1, device=device)
                 return none, torch.full_like(none, -torch.inf, dtype=torch.float32), none * 0
-            columns, found = self._prepare(), (database.storage, query)
-            if isinstance(columns.rule, RankedRule):  # the order of all neighbours is not needed
-                row, near, hit = database.sampler.best(*found, columns.rule.rank)
-                target = columns.rule.target.index_select(0, row.clamp_min(0))
-            else:
-                rows, nears = database.sampler.nearest(*found)  # [Q, k]
-                valid = nears >= database.sampler.threshold
-                target, place = columns.rule(rows.clamp_min(0), valid)
-                hit = valid[:, 0]  # the most similar comes first
-                place = torch.where(hit[:, None], place, 0)
-                row, near = rows.gather(-1, place)[:, 0], nears.gather(-1, place)[:, 0]
-        index = torch.where(hit, target, -1)
-        offset = torch.where(hit, target - row, 0)
-        return index.to(device), near.float().to(device), offset.to(device)
+            found = self._prepare().rule.choose(database.sampler, database.storage, query, goals)
+        index = torch.where(found.hit, found.target, -1)
+        offset = torch.where(found.hit, found.target - found.row, 0)
+        return index.to(device), found.similarity.float().to(device), offset.to(device)
 
     def _prepare(self) -> _Columns:
         """The columns of the database as it is; made anew when its search structure was."""
@@ -232,18 +261,24 @@ class RetrievalTargetModule(TensorDictModuleBase):
         if self._columns is None or self._columns.source is not source:
             rows = self.database[:]
             values, remaining = rows["return_to_go"], rows["remaining"]
-            if self.rule == "followed":
-                rule: RankedRule | TolerantRule = followed_rule(values, remaining, self.ahead)
+            key, gamma = self.database.sampler.key, self.database.gamma
+            if self.goal_key is not None:
+                table = GoalTable(rows, key, gamma, self.goal_reward)
+                ahead = self.ahead if self.rule == "followed" else None
+                rule: TargetRule = GoalRule(table, self.horizon, self.min_offset, ahead)
+            elif self.rule == "followed":
+                rule = followed_rule(values, remaining, self.ahead)
             else:
                 limits = (self.horizon, self.min_offset, self.tolerance)
                 rule = highest_rule(values, remaining, *limits)
-            states = rows[self.database.sampler.key]
-            self._columns = _Columns(source, states, values, rule)
+            self._columns = _Columns(source, rows[key], rule)
         return self._columns
 
     # keeping a target for several steps
 
-    def _kept(self, tensordict: TensorDictBase, query: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def _kept(
+        self, tensordict: TensorDictBase, query: Tensor, goals: Tensor | None
+    ) -> tuple[Tensor, Tensor, Tensor]:
         kept, start = tensordict.get(KEPT), tensordict.get("is_init")
         if kept is None or start is None:
             raise KeyError(
@@ -258,7 +293,8 @@ class RetrievalTargetModule(TensorDictModuleBase):
         state = kept.reshape(-1, 4) + kept.new_tensor([0.0, 0.0, -1.0, 1.0])
         state[:, 2].clamp_min_(0.0)
         if fresh.any():
-            renewed = torch.stack([value.double() for value in self.select(query[fresh])], -1)
+            found = self.select(query[fresh], None if goals is None else goals[fresh])
+            renewed = torch.stack([value.double() for value in found], -1)
             state[fresh] = torch.nn.functional.pad(renewed, (0, 1), value=1.0)
         tensordict.set(("next", *KEPT), state.reshape(kept.shape))
         return state[:, 0].long(), state[:, 1].float(), state[:, 2].long()

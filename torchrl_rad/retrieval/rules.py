@@ -2,14 +2,45 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import torch
 from torch import Tensor
 
 from torchrl_rad.retrieval.windows import WindowMax
 
-__all__ = ["RankedRule", "TolerantRule", "followed_rule", "highest_rule"]
+if TYPE_CHECKING:
+    from torchrl_rad.retrieval.sampler import RetrievalSampler
+
+__all__ = ["Choice", "RankedRule", "TargetRule", "TolerantRule", "followed_rule", "highest_rule"]
+
+
+class Choice(NamedTuple):
+    """What a rule chose for each of Q queries.
+
+    Attributes:
+        target: int64 [Q], the row to go for; any row where there is no neighbour.
+        row: int64 [Q], the neighbour through which it is reached; -1 where there is no row at all.
+        similarity: float64 [Q], its; of the most similar row where there is no neighbour.
+        hit: bool [Q], whether there is a neighbour.
+    """
+
+    target: Tensor
+    row: Tensor
+    similarity: Tensor
+    hit: Tensor
+
+
+class TargetRule(Protocol):
+    """Says which row to go for."""
+
+    def choose(
+        self, sampler: RetrievalSampler, storage: Any, query: Tensor, goals: Tensor | None
+    ) -> Choice:
+        """Asks the sampler for neighbours of queries [Q, S] and chooses for each; goals [Q, G]."""
+
+    def value(self, rows: Tensor, goals: Tensor | None) -> Tensor:
+        """Return of rows, float32 [Q]."""
 
 
 class RankedRule(NamedTuple):
@@ -20,10 +51,22 @@ class RankedRule(NamedTuple):
     Attributes:
         rank: int [N], not negative.
         target: int64 [N], the row to go for from each row.
+        values: float32 [N], returns.
     """
 
     rank: Tensor
     target: Tensor
+    values: Tensor
+
+    def choose(
+        self, sampler: RetrievalSampler, storage: Any, query: Tensor, goals: Tensor | None = None
+    ) -> Choice:
+        # the order of all neighbours is not needed
+        row, near, hit = sampler.best(storage, query, self.rank)
+        return Choice(self.target.index_select(0, row.clamp_min(0)), row, near, hit)
+
+    def value(self, rows: Tensor, goals: Tensor | None = None) -> Tensor:
+        return self.values.index_select(0, rows)
 
 
 class TolerantRule:
@@ -53,6 +96,19 @@ class TolerantRule:
         )
         self.low, self.high = _window(remaining, min_offset, horizon - 1)
         self.peak = self.table.max(self.low, self.high)
+
+    def choose(
+        self, sampler: RetrievalSampler, storage: Any, query: Tensor, goals: Tensor | None = None
+    ) -> Choice:
+        rows, near = sampler.nearest(storage, query)  # [Q, k]
+        valid = near >= sampler.threshold
+        target, place = self(rows.clamp_min(0), valid)
+        hit = valid[:, 0]  # the most similar comes first
+        place = torch.where(hit[:, None], place, 0)
+        return Choice(target, rows.gather(-1, place)[:, 0], near.gather(-1, place)[:, 0], hit)
+
+    def value(self, rows: Tensor, goals: Tensor | None = None) -> Tensor:
+        return self.table.values.index_select(0, rows)
 
     def __call__(self, rows: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
         """Chooses a row for each query.
@@ -94,7 +150,7 @@ def followed_rule(values: Tensor, remaining: Tensor, ahead: int) -> RankedRule:
     table = WindowMax(values, ahead + 1)
     low, high = _window(remaining, 0, ahead)
     target = table.first(low, high, table.max(low, high), 0.0)
-    return RankedRule(_narrow(values.unique(return_inverse=True)[1]), target)
+    return RankedRule(_narrow(values.unique(return_inverse=True)[1]), target, values)
 
 
 def highest_rule(
@@ -117,7 +173,7 @@ def highest_rule(
     order = order[values[rows[order]].sort(stable=True).indices]
     rank = torch.empty_like(order)
     rank[order] = torch.arange(len(rows), device=rows.device)
-    return RankedRule(_narrow(rank[place]), target)
+    return RankedRule(_narrow(rank[place]), target, values)
 
 
 def _narrow(rank: Tensor) -> Tensor:

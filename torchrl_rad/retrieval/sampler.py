@@ -149,8 +149,13 @@ class RetrievalSampler(Sampler):
         info = {name: value.reshape(shape).to(device) for name, value in info.items()}
         return index.reshape(shape).to(device), info
 
-    def nearest(self, storage: Any, query: Tensor) -> tuple[Tensor, Tensor]:
+    def nearest(self, storage: Any, query: Tensor, k: int | None = None) -> tuple[Tensor, Tensor]:
         """The nearest rows of queries [Q, S], whatever the threshold.
+
+        Args:
+            storage (Storage): where the rows are.
+            query (Tensor): [Q, S] in raw units.
+            k (int, optional): number of rows. Defaults to that of the sampler.
 
         Returns:
             Rows, int64 [Q, min(k, N)], and similarities, float64, on the device of the rows; -1 and
@@ -161,7 +166,7 @@ class RetrievalSampler(Sampler):
             rows = torch.full((len(query), 0), -1)
             return rows, torch.empty(len(query), 0, dtype=torch.float64)
         index, query, finite = self._ready(storage, query)
-        k = min(self.k, count)
+        k = min(self.k if k is None else k, count)
         near, rows = _joined([index.search(part, k) for part in self._parts(query, k)])
         if finite is not None:
             near, rows = torch.where(finite, near, -torch.inf), torch.where(finite, rows, -1)

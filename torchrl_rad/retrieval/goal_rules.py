@@ -1,0 +1,145 @@
+"""The target rules with returns that depend on the goal of the query."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchrl_rad.retrieval import search
+from torchrl_rad.retrieval.goals import GoalReturns, GoalTable
+from torchrl_rad.retrieval.rules import Choice
+from torchrl_rad.retrieval.sampler import RetrievalSampler
+
+__all__ = ["GoalRule", "goal_followed", "goal_highest", "goal_neighbours"]
+
+MORE = 1.5  # times as many rows are looked at as should hold k of demonstrations
+
+
+def goal_neighbours(
+    sampler: RetrievalSampler, storage: Any, query: Tensor, returns: GoalReturns, goal: Tensor
+) -> Iterator[tuple[Tensor, Tensor, Tensor, Tensor]]:
+    """The neighbours of queries among the rows of demonstrations for their goals.
+
+    As many of the nearest rows are looked at as hold k of them, or all that are similar enough.
+
+    Args:
+        sampler (RetrievalSampler): finds the rows.
+        storage (Storage): where they are.
+        query (Tensor): [Q, S] in raw units.
+        returns (GoalReturns): of the goals.
+        goal (Tensor): int64 [Q], which goal each query has.
+
+    Yields:
+        For n of the queries, in the end for each whose goal somebody reaches: which, int64 [n];
+        rows, int64 [n, C], most similar first; their similarities, float64; and which of them are
+        neighbours, bool, k at most.
+    """
+    total = len(returns.last)
+    k = min(sampler.k, total)
+    todo = (returns.share[goal] > 0).nonzero()[:, 0]
+    if len(todo) == 0:
+        return
+    count = min(total, int(MORE * k / float(returns.share[goal[todo]].min())) + 1)
+    while len(todo):
+        unsettled = []
+        for part in todo.split(max(1, search.SCAN_ENTRIES // count)):
+            rows, near = sampler.nearest(storage, query[part], count)
+            rows = rows.clamp_min(0)  # of a query with NaN
+            valid = near >= sampler.threshold
+            settled = ~valid[:, -1] | (count == total)
+            valid &= returns.experts[goal[part][:, None], returns.episode[rows]]
+            rank = valid.cumsum(-1)
+            settled |= rank[:, -1] >= k
+            valid &= rank <= k
+            yield part[settled], rows[settled], near[settled], valid[settled]
+            unsettled.append(part[~settled])
+        todo, count = torch.cat(unsettled), min(4 * count, total)
+
+
+def goal_followed(
+    returns: GoalReturns, goal: Tensor, rows: Tensor, valid: Tensor, ahead: int
+) -> tuple[Tensor, Tensor]:
+    """``rule="followed"``: the neighbour with the largest return; the best of its next rows.
+
+    Args:
+        returns (GoalReturns): of the goals.
+        goal (Tensor): int64 [Q], which goal each query has.
+        rows (Tensor): int64 [Q, C], neighbours, most similar first.
+        valid (Tensor): bool [Q, C], which of them are neighbours; at least one.
+        ahead (int): number of rows looked ahead.
+
+    Returns:
+        The row to go for, int64 [Q], and the place of its neighbour in ``rows``, int64 [Q, 1].
+    """
+    goal = goal[:, None]
+    value, _ = returns.value_and_end(rows, goal)
+    place = torch.where(valid, value, -torch.inf).argmax(-1, keepdim=True)  # the first of equals
+    row = rows.gather(-1, place)
+    _, end = returns.value_and_end(row, goal)
+    return returns.best(row, torch.minimum(row + ahead, end), goal)[1][:, 0], place
+
+
+def goal_highest(
+    returns: GoalReturns, goal: Tensor, rows: Tensor, valid: Tensor, horizon: int, min_offset: int
+) -> tuple[Tensor, Tensor]:
+    """``rule="highest"``, the paper's, without tolerance; arguments as of :func:`goal_followed`.
+
+    ``horizon`` and ``min_offset`` are those of
+    :class:`~torchrl_rad.modules.RetrievalTargetModule`.
+    """
+    goal = goal[:, None]
+    _, end = returns.value_and_end(rows, goal)
+    low, high = (torch.minimum(rows + most, end) for most in (min_offset, horizon - 1))
+    peak, first = returns.best(low, high, goal)
+    peak = torch.where(valid, peak, -torch.inf)
+    fits = valid & (peak == peak.amax(-1, keepdim=True))
+    # of the rows that pay most the one with the most steps left, then the lowest
+    left = returns.value_and_end(first, goal)[1] - first
+    left = torch.where(fits, left, -1)
+    fits &= left == left.amax(-1, keepdim=True)
+    target = torch.where(fits, first, torch.iinfo(torch.int64).max).amin(-1, keepdim=True)
+    reaches = valid & (low <= target) & (target <= high)
+    return target[:, 0], reaches.int().argmax(-1, keepdim=True)
+
+
+class GoalRule:
+    """Either rule with the returns of the goal that comes with each query.
+
+    Args:
+        table (GoalTable): of the database.
+        horizon, min_offset (int): of :func:`goal_highest`.
+        ahead (int, optional): of :func:`goal_followed`, which is the rule if it is given.
+    """
+
+    def __init__(self, table: GoalTable, horizon: int, min_offset: int, ahead: int | None = None):
+        self.table, self.horizon, self.min_offset, self.ahead = table, horizon, min_offset, ahead
+
+    def choose(
+        self, sampler: RetrievalSampler, storage: Any, query: Tensor, goals: Tensor | None
+    ) -> Choice:
+        """As :meth:`~torchrl_rad.retrieval.rules.TargetRule.choose`."""
+        assert goals is not None
+        number, returns = self.table.look_up(goals)
+        row, near = (column[:, 0] for column in sampler.nearest(storage, query, 1))
+        target, number = torch.zeros_like(row), number.to(row.device)
+        hit = torch.zeros_like(row, dtype=torch.bool)
+        for part, rows, nears, valid in goal_neighbours(sampler, storage, query, returns, number):
+            asked = (returns, number[part], rows, valid)
+            if self.ahead is None:
+                chosen, place = goal_highest(*asked, self.horizon, self.min_offset)
+            else:
+                chosen, place = goal_followed(*asked, self.ahead)
+            hit[part] = valid.any(-1)
+            target[part] = torch.where(hit[part], chosen, 0)
+            row[part] = torch.where(hit[part], rows.gather(-1, place)[:, 0], row[part])
+            near[part] = torch.where(hit[part], nears.gather(-1, place)[:, 0], near[part])
+        return Choice(target, row, near, hit)
+
+    def value(self, rows: Tensor, goals: Tensor | None) -> Tensor:
+        """Return of rows for the goal of each, float32 [Q]."""
+        assert goals is not None
+        number, returns = self.table.look_up(goals)
+        return returns.value_and_end(rows, number)[0]
