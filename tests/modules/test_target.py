@@ -458,7 +458,7 @@ def test_interval_of_one_needs_nothing_kept():
 def kept(select, states, is_init, before=None):
     """One step by hand; returns the tensordict and what is kept after it."""
     count = len(states)
-    before = torch.zeros(count, 4, dtype=torch.float64) if before is None else before
+    before = torch.zeros(count, 5, dtype=torch.float64) if before is None else before
     tensordict = TensorDict(
         {
             "observation": torch.as_tensor(states),
@@ -488,7 +488,7 @@ def test_only_a_target_is_kept():
 def test_what_was_never_asked_is_not_kept():
     # as the primer left it, without a reset: row 0 is no target
     out, after = kept(module(places(), retrieval_interval=5), [[7.0]], [False])
-    assert out["target_index"] == 7 and after.tolist() == [[7.0, 1.0, 0.0, 1.0]]
+    assert out["target_index"] == 7 and after.tolist() == [[7.0, 1.0, 0.0, 1.0, 0.0]]
 
 
 def test_rows_that_are_gone_are_not_kept():

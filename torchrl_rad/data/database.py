@@ -2,22 +2,15 @@
 
 from __future__ import annotations
 
-import atexit
-import errno
-import hashlib
-import json
-import shutil
-import tempfile
-from collections.abc import Callable
-from pathlib import Path
+import warnings
+from collections.abc import Callable, Iterable
 from typing import Any, NoReturn
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.data import LazyMemmapStorage, LazyTensorStorage, TensorDictReplayBuffer, TensorStorage
+from torchrl.data import LazyTensorStorage, TensorStorage
 
-from torchrl_rad._files import staged_folder, write_json
 from torchrl_rad.data.checks import check_finite, check_same_columns, check_steps, flat_steps
 from torchrl_rad.data.episodes import (
     episode_ids,
@@ -25,14 +18,15 @@ from torchrl_rad.data.episodes import (
     return_to_go,
     step_and_remaining,
 )
-from torchrl_rad.data.experts import Expert, select_episodes
-from torchrl_rad.data.saved import FORMAT, build, read_config, replaceable, require_space
+from torchrl_rad.data.experts import select_episodes
+from torchrl_rad.data.growth import EVICTIONS, copies, evicted, kept_names, new_reward
+from torchrl_rad.data.saving import SavedReplayBuffer
 from torchrl_rad.retrieval.sampler import RetrievalSampler, storage_revision
 
 __all__ = ["ExpertDatabase"]
 
 
-class ExpertDatabase(TensorDictReplayBuffer):
+class ExpertDatabase(SavedReplayBuffer):
     r"""Recorded demonstrations, searched by state (TS of RAD; paper section "Target Selection").
 
     A :class:`~torchrl.data.TensorDictReplayBuffer` that is filled with whole episodes. To the
@@ -58,10 +52,13 @@ class ExpertDatabase(TensorDictReplayBuffer):
         gamma (float, optional): discount of ``return_to_go``, in [0, 1]. Defaults to ``0.99``.
         expert (callable, optional): one episode -> bool, which episodes to keep. Defaults to all.
         sampler (RetrievalSampler, optional): how rows are found.
+        evict (str, optional): whole episodes give way to new ones where these do not fit:
+            ``"oldest"``, those added first, or ``"lowest_return"``, those that pay least from their
+            first step on. Defaults to none: what does not fit is refused.
         **kwargs: of :class:`~torchrl.data.TensorDictReplayBuffer`.
 
     Raises:
-        ValueError: ``gamma`` lies outside [0, 1].
+        ValueError: ``gamma`` lies outside [0, 1], or ``evict`` is another word.
         TypeError: ``sampler`` is no RetrievalSampler, or ``storage`` holds no tensors.
 
     Examples:
@@ -86,10 +83,13 @@ class ExpertDatabase(TensorDictReplayBuffer):
         gamma: float = 0.99,
         expert: Callable[[TensorDictBase], bool] | None = None,
         sampler: RetrievalSampler | None = None,
+        evict: str | None = None,
         **kwargs: Any,
     ):
         if not 0.0 <= gamma <= 1.0:
             raise ValueError(f"gamma is {gamma}; a discount lies in [0, 1].")
+        if evict not in (None, *EVICTIONS):
+            raise ValueError(f"evict is {evict!r}; expected one of {EVICTIONS}, or None.")
         if sampler is not None and not isinstance(sampler, RetrievalSampler):
             raise TypeError(f"sampler must be a RetrievalSampler, got {type(sampler).__name__}.")
         if storage is not None and not isinstance(storage, TensorStorage):
@@ -102,9 +102,8 @@ class ExpertDatabase(TensorDictReplayBuffer):
             sampler=RetrievalSampler() if sampler is None else sampler,
             **kwargs,
         )
-        self.gamma, self.expert = float(gamma), expert
-        self.path: Path | None = None  # where this content is saved
-        self._saved: tuple | None = None
+        self.gamma, self.expert, self.evict = float(gamma), expert, evict
+        self.version = 0  # raised when rewards change or rows move
 
     # filling
 
@@ -112,7 +111,8 @@ class ExpertDatabase(TensorDictReplayBuffer):
         """Adds those of the episodes that the expert rule keeps, all at once.
 
         A query from another thread sees all of these rows or none. Ids that are in use already are
-        shifted past those.
+        shifted past those; episodes that are there already count twice, with a warning. The search
+        structure is extended, and built anew when a fifth of the rows are new.
 
         Args:
             tensordicts (TensorDictBase): flat steps [T] of whole episodes: ``observation`` [T, S],
@@ -140,14 +140,23 @@ class ExpertDatabase(TensorDictReplayBuffer):
             if len(self):
                 check_same_columns(steps, self._storage[:])
             steps = self._experts(steps, lengths)
-            room = self._storage.max_size - len(self)
-            if len(steps) > room:
-                raise ValueError(
-                    f"{len(steps)} rows do not fit: the storage has room for "
-                    f"{self._storage.max_size}, of which {len(self)} are taken. Give the database "
-                    "a larger storage (one opened with memmap=True cannot grow)."
-                )
-            return super().extend(steps, update_priority=update_priority)
+            self._make_room(len(steps))
+            before = storage_revision(self._storage)
+            written = super().extend(steps, update_priority=update_priority)
+            self._sampler.extended(self._storage, before)
+            return written
+
+    def _make_room(self, count: int) -> None:
+        size, taken = self._storage.max_size, len(self)
+        if taken + count <= size:
+            return
+        if self.evict is None or count > size:
+            raise ValueError(
+                f"{count} rows do not fit: the storage has room for {size}, of which {taken} are "
+                "taken. Give the database a larger storage (one opened with memmap=True cannot "
+                'grow), or let old episodes give way, with evict="oldest".'
+            )
+        self._remove(evicted(self._storage[:], taken + count - size, self.evict))
 
     def add(self, data: TensorDictBase) -> NoReturn:
         """Refuses single steps: what a step is worth shows when its episode is over.
@@ -169,9 +178,22 @@ class ExpertDatabase(TensorDictReplayBuffer):
             taken = self._storage[:]["episode"]
             if torch.isin(ids, taken).any():
                 ids = ids - ids.min() + taken.max() + 1
-        value = return_to_go(steps["next", "reward"], lengths, self.gamma)
-        columns = {"episode": ids, "step": step, "remaining": remaining}
-        return steps.update({**columns, "return_to_go": value.to(device)})
+        value = return_to_go(steps["next", "reward"], lengths, self.gamma).to(device)
+        columns = {"episode": ids, "step": step, "remaining": remaining, "return_to_go": value}
+        steps = steps.update(columns)
+        if len(self):
+            for name in kept_names(self._storage[:]):  # of before relabelling: as they are now
+                steps.set((name, "reward"), steps["next", "reward"])
+                steps.set((name, "return_to_go"), value)
+            again = copies(self._storage[:], steps, self._sampler.key)
+            if again:
+                warnings.warn(
+                    f"{len(again)} episodes are in the database already and now count twice: "
+                    f"episode {again[0][0]} has the states of episode {again[0][1]}. "
+                    f"forget([{again[0][0]}]) removes it.",
+                    stacklevel=3,
+                )
+        return steps
 
     def _experts(self, steps: TensorDictBase, lengths: Tensor) -> TensorDictBase:
         if self.expert is None:
@@ -183,6 +205,103 @@ class ExpertDatabase(TensorDictReplayBuffer):
                 "choose another rule (top_share_by_return(0.1) always keeps some), or None for all."
             )
         return steps[torch.repeat_interleave(keep, lengths).to(steps["step"].device)]
+
+    # changing what is there
+
+    def relabel(self, reward: Any, keep: str | None = None) -> None:
+        """Gives all rows another reward, and the returns that follow from it.
+
+        A policy in use answers with the new returns at its next step. The expert rule is not asked
+        again: a database for several goals holds all episodes.
+
+        Args:
+            reward: [N] or [N, 1]; a function of the rows (TensorDict [N]) that gives it; or the
+                name of an entry, such as ``("before", "reward")``.
+            keep (str, optional): a name under which ``reward`` and ``return_to_go`` of before stay
+                as columns: ``(keep, "reward")`` [N, 1] and ``(keep, "return_to_go")`` [N].
+
+        Raises:
+            RuntimeError: the database is empty.
+            KeyError: there is no entry of that name.
+            TypeError: no numbers came.
+            ValueError: another length; NaN or Inf, named by episode and step; ``keep`` is the name
+                of a column.
+
+        Examples:
+            >>> from tensordict import TensorDict
+            >>> database = ExpertDatabase(LazyTensorStorage(2), gamma=0.5)
+            >>> end = {"reward": torch.zeros(2, 1), "done": torch.tensor([[False], [True]])}
+            >>> steps = {"observation": torch.tensor([[0.0], [1.0]]), "next": end}
+            >>> _ = database.extend(TensorDict(steps, [2]))
+            >>> database.relabel(lambda rows: (rows["observation"] > 0.5).float(), keep="before")
+            >>> database[:]["return_to_go"], database[:]["before", "return_to_go"]
+            (tensor([0.5000, 1.0000]), tensor([0., 0.]))
+        """
+        with self._replay_lock, self._write_lock:
+            self._require_rows("relabelling them")
+            rows = self._storage[:]
+            if keep is not None and keep in rows.keys() and keep not in kept_names(rows):
+                raise ValueError(f"keep is {keep!r}, which is a column of the database.")
+            new, value = new_reward(rows, reward, self.gamma)
+            changed: dict[Any, Tensor] = {("next", "reward"): new, "return_to_go": value}
+            if keep is not None:
+                changed[keep, "reward"] = rows["next", "reward"]
+                changed[keep, "return_to_go"] = rows["return_to_go"]
+            self._set_columns(changed)
+
+    def _set_columns(self, columns: dict[Any, Tensor]) -> None:
+        """Replaces or adds columns [N, ...], out of place: files of a memory map stay."""
+        whole = self._storage._storage.copy()  # a new table of the same tensors
+        for key, column in columns.items():
+            present = whole.get(key, None)
+            room = column.new_zeros(len(whole), *column.shape[1:])
+            room[: len(column)] = column
+            whole.set(key, room if present is None else room.to(present.device))
+        self._storage._storage = whole
+        self.version += 1
+        self._saved = None
+
+    def forget(self, episodes: Iterable[int]) -> int:
+        """Removes demonstrations: they are not found again, and not saved again.
+
+        A folder that was saved before keeps them until :meth:`dumps` replaces it.
+
+        Args:
+            episodes (iterable of int): ids, as in the column ``episode``.
+
+        Returns:
+            Number of rows removed.
+
+        Raises:
+            KeyError: an id that is not there; nothing is removed then.
+        """
+        wanted = torch.as_tensor(list(episodes), dtype=torch.int64)
+        with self._replay_lock, self._write_lock:
+            ids = self._storage[:]["episode"].cpu() if len(self) else wanted.new_zeros(0)
+            unknown = wanted[~torch.isin(wanted, ids)]
+            if len(unknown):
+                raise KeyError(
+                    f"episodes {unknown.tolist()} are not in the database, which holds "
+                    f"{len(ids.unique())} others."
+                )
+            gone = torch.isin(ids, wanted)
+            if gone.any():
+                self._remove(gone)
+            return int(gone.sum())
+
+    def _remove(self, gone: Tensor) -> None:
+        """Closes the gaps that some rows, bool [N], leave."""
+        if type(self._storage) is TensorStorage:
+            raise RuntimeError(
+                "a database opened with memmap=True cannot change; open it with loads(path)."
+            )
+        kept = self._storage[:][~gone.to(self.device)].clone()
+        self._storage._storage.zero_()  # what is removed does not stay in a file beyond the end
+        self.empty()
+        if len(kept):
+            super().extend(kept.exclude("index"))
+        self.version += 1
+        self._saved = None
 
     # asking
 
@@ -206,10 +325,6 @@ class ExpertDatabase(TensorDictReplayBuffer):
         """Where the rows are."""
         device = self._storage.device
         return torch.device("cpu" if device in ("auto", None) else device)
-
-    def _require_rows(self, purpose: str) -> None:
-        if len(self) == 0:
-            raise RuntimeError(f"the database is empty: extend it with episodes before {purpose}.")
 
     def retrieve(self, query: Tensor) -> TensorDict:
         """The neighbours of each query: as :meth:`sample`, with a search in place of the draw.
@@ -236,133 +351,3 @@ class ExpertDatabase(TensorDictReplayBuffer):
         hits = hits.to(query.device).exclude("index")
         hits.update({"index": index, **info})
         return hits
-
-    def digest(self) -> str:
-        """sha256 of the rows, discount, expert rule and search settings.
-
-        Where the rows are kept does not matter: a saved database has the digest of its source,
-        memory-mapped or not.
-        """
-        settings = {name: self._config()[name] for name in ("gamma", "expert", "sampler")}
-        hashed = hashlib.sha256(json.dumps(settings, sort_keys=True).encode())
-        with self._replay_lock:
-            rows = self._storage[:] if len(self) else TensorDict()
-            for key in sorted(rows.keys(True, True), key=str):
-                value = rows.get(key)
-                if key == "index" or not isinstance(value, Tensor):
-                    continue
-                value = value.detach().cpu().contiguous()
-                hashed.update(f"{key} {value.dtype} {list(value.shape)}".encode())
-                hashed.update(value.reshape(-1).view(torch.uint8).numpy().data)
-        return hashed.hexdigest()
-
-    # saving, copying, sending
-
-    def _config(self) -> dict[str, Any]:
-        rule: Any = None
-        if isinstance(self.expert, Expert):
-            rule = self.expert.config
-        elif self.expert is not None:
-            rule = getattr(self.expert, "__qualname__", type(self.expert).__qualname__)
-        return {
-            "format": FORMAT,
-            "gamma": self.gamma,
-            "expert": rule,
-            "capacity": self._storage.max_size,
-            "sampler": json.loads(json.dumps(self._sampler.config)),
-            "memmap": isinstance(self._storage, LazyMemmapStorage),
-        }
-
-    def dumps(self, path: str | Path) -> None:
-        """Saves rows and settings in a folder, which appears only when it is complete.
-
-        A database that lies there is replaced, once the new one is whole.
-
-        Args:
-            path (path): a new or empty folder, or one of a saved database.
-
-        Raises:
-            RuntimeError: the database is empty.
-            FileExistsError: something else lies there.
-            OSError: it cannot be written, for one thing because the disk is full; what lay there
-                before is untouched.
-        """
-        path = Path(path).absolute()
-        self._require_rows("saving it")
-        if path.exists() and not replaceable(path):
-            raise FileExistsError(
-                errno.EEXIST,
-                "dumps writes a folder of its own; this one has other content",
-                str(path),
-            )
-        with self._replay_lock:
-            rows = self._storage[:]
-            path.parent.mkdir(parents=True, exist_ok=True)
-            require_space(path.parent, rows.bytes())
-            with staged_folder(path, replace=True) as stage:
-                rows.memmap(stage / "rows", copy_existing=True)
-                write_json(stage / "database.json", self._config())
-            self.path, self._saved = path, storage_revision(self._storage)
-
-    @classmethod
-    def loads(  # type: ignore[override]
-        cls,
-        path: str | Path,
-        memmap: bool = False,
-        expert: Callable[[TensorDictBase], bool] | None = None,
-        **kwargs: Any,
-    ) -> ExpertDatabase:
-        """Opens a saved database.
-
-        Args:
-            path (path): the folder.
-            memmap (bool, optional): read the rows from the file as they are asked for; such a
-                database cannot grow. Their sizes are checked, not their sha256. Defaults to
-                ``False``: a storage of the kind and capacity that was saved.
-            expert (callable, optional): the rule for further episodes. Defaults to the one saved;
-                a plain function cannot be saved, and has to be passed again before extending.
-            **kwargs: of :class:`~torchrl.data.TensorDictReplayBuffer`.
-
-        Raises:
-            FileNotFoundError: the folder does not hold a database.
-            CheckpointError: a file is missing, damaged or cut short.
-        """
-        path = Path(path).absolute()
-        config = read_config(path, memmap)
-        rows = TensorDict.load_memmap(path / "rows")
-        kind = LazyMemmapStorage if config["memmap"] else LazyTensorStorage
-        storage = TensorStorage(rows) if memmap else kind(config["capacity"])
-        database = build(cls, config, storage, expert, kwargs)
-        if not memmap:
-            TensorDictReplayBuffer.extend(database, rows)
-        database.path, database._saved = path, storage_revision(database._storage)
-        return database
-
-    def __copy__(self) -> ExpertDatabase:
-        return self
-
-    def __deepcopy__(self, memo: dict[int, Any]) -> ExpertDatabase:
-        return self
-
-    def __reduce__(self) -> tuple:
-        transform = (
-            self._transform if self._transform is not None and len(self._transform) else None
-        )
-        kwargs = {"batch_size": self._batch_size, "transform": transform}
-        if len(self) == 0:
-            return _empty, (self._config(), kwargs)
-        current = self._saved == storage_revision(self._storage)
-        if self.path is None or not current or not (self.path / "database.json").exists():
-            folder = tempfile.mkdtemp(prefix="torchrl_rad-")
-            atexit.register(shutil.rmtree, folder, ignore_errors=True)
-            self.dumps(Path(folder) / "database")
-        return _open, (str(self.path), kwargs)
-
-
-def _open(path: str, kwargs: dict[str, Any]) -> ExpertDatabase:
-    return ExpertDatabase.loads(path, memmap=True, **kwargs)
-
-
-def _empty(config: dict[str, Any], kwargs: dict[str, Any]) -> ExpertDatabase:
-    kind = LazyMemmapStorage if config["memmap"] else LazyTensorStorage
-    return build(ExpertDatabase, config, kind(config["capacity"]), None, kwargs)

@@ -29,7 +29,8 @@ def build(cls: type, config: dict[str, Any], storage: Any, expert: Any, kwargs: 
         settings["key"] = tuple(settings["key"])
     if expert is None and rule is not None:
         expert = _Unsaved(rule) if isinstance(rule, str) else expert_from_config(rule)
-    return cls(storage, config["gamma"], expert, RetrievalSampler(**settings), **kwargs)
+    sampler = RetrievalSampler(**settings)
+    return cls(storage, config["gamma"], expert, sampler, config.get("evict"), **kwargs)
 
 
 class _Unsaved:

@@ -22,11 +22,12 @@ __all__ = ["RetrievalTargetModule"]
 
 OUT_KEYS = ("target", "found", "similarity", "target_return", "target_index")
 QUERIES = 4096  # asked at a time: each has k neighbours
-KEPT = ("retrieval", "kept")  # float64 [*B, 4]: row, similarity, offset, age
+KEPT = ("retrieval", "kept")  # float64 [*B, 5]: row, similarity, offset, age, version
 
 
 class _Columns(NamedTuple):
     source: object  # the search structure that they belong to
+    version: int  # of the database
     states: Tensor
     rule: TargetRule
 
@@ -258,7 +259,8 @@ class RetrievalTargetModule(TensorDictModuleBase):
     def _prepare(self) -> _Columns:
         """The columns of the database as it is; made anew when its search structure was."""
         source = self.database.sampler.build(self.database.storage)
-        if self._columns is None or self._columns.source is not source:
+        version, columns = self.database.version, self._columns
+        if columns is None or columns.source is not source or columns.version != version:
             rows = self.database[:]
             values, remaining = rows["return_to_go"], rows["remaining"]
             key, gamma = self.database.sampler.key, self.database.gamma
@@ -271,8 +273,8 @@ class RetrievalTargetModule(TensorDictModuleBase):
             else:
                 limits = (self.horizon, self.min_offset, self.tolerance)
                 rule = highest_rule(values, remaining, *limits)
-            self._columns = _Columns(source, rows[key], rule)
-        return self._columns
+            self._columns = columns = _Columns(source, version, rows[key], rule)
+        return columns
 
     # keeping a target for several steps
 
@@ -285,17 +287,23 @@ class RetrievalTargetModule(TensorDictModuleBase):
                 f"retrieval_interval={self.retrieval_interval} needs 'is_init' and {KEPT} in the "
                 "tensordict; add InitTracker() and make_tensordict_primer() to the environment."
             )
-        index, _, _, age = kept.reshape(-1, 4).unbind(-1)
+        index, _, _, age, version = kept.reshape(-1, 5).unbind(-1)
         fresh = start.reshape(-1) | (age >= self.retrieval_interval) | (age == 0)
-        # nothing to keep: no target yet, a row that is gone, a state that is none
-        fresh |= (index < 0) | (index >= len(self.database)) | ~query.isfinite().all(-1)
+        # nothing to keep: no target yet, a row that is gone or moved, a state that is none
+        fresh |= (
+            (version != self.database.version)
+            | (index < 0)
+            | (index >= len(self.database))
+            | ~query.isfinite().all(-1)
+        )
         # a kept target comes one recorded step nearer with each step
-        state = kept.reshape(-1, 4) + kept.new_tensor([0.0, 0.0, -1.0, 1.0])
+        state = kept.reshape(-1, 5) + kept.new_tensor([0.0, 0.0, -1.0, 1.0, 0.0])
         state[:, 2].clamp_min_(0.0)
         if fresh.any():
             found = self.select(query[fresh], None if goals is None else goals[fresh])
             renewed = torch.stack([value.double() for value in found], -1)
-            state[fresh] = torch.nn.functional.pad(renewed, (0, 1), value=1.0)
+            age_and_version = renewed.new_tensor([1.0, self.database.version])
+            state[fresh] = torch.cat([renewed, age_and_version.expand(len(renewed), 2)], -1)
         tensordict.set(("next", *KEPT), state.reshape(kept.shape))
         return state[:, 0].long(), state[:, 1].float(), state[:, 2].long()
 
@@ -310,7 +318,7 @@ class RetrievalTargetModule(TensorDictModuleBase):
         return self._primer
 
     def _primer(self) -> TensorDictPrimer:
-        spec = Unbounded((4,), dtype=torch.float64)
+        spec = Unbounded((5,), dtype=torch.float64)
         return TensorDictPrimer({KEPT: spec}, default_value=0.0, expand_specs=True)
 
     def __getstate__(self) -> dict[str, Any]:

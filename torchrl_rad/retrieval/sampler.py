@@ -11,7 +11,7 @@ from torch import Tensor
 from torchrl.data.replay_buffers.samplers import Sampler
 
 from torchrl_rad.retrieval import search
-from torchrl_rad.retrieval.backends import BACKENDS, build_index
+from torchrl_rad.retrieval.backends import BACKENDS, build_index, grow_index
 from torchrl_rad.retrieval.choice import Candidates, Metric, choose, first_by_rank, similarity
 from torchrl_rad.retrieval.index import SearchIndex
 
@@ -71,6 +71,7 @@ class RetrievalSampler(Sampler):
     _index: SearchIndex | None
     _scale: tuple[Tensor, Tensor] | None
     _width: int  # of a state in the storage
+    _grown: bool  # rows were added since the index was built
 
     def __init__(
         self,
@@ -260,7 +261,16 @@ class RetrievalSampler(Sampler):
                 rows = self._prepare(states)
             self._index = build_index(rows, self.metric, self.backend, self.k)
             self._revision = revision
+        elif self._grown:
+            rows = self._prepare(storage[:].get(self.key))
+            self._index = grow_index(self._index, rows, self.metric, self.backend, self.k)
+            self._grown = False
         return self._index
+
+    def extended(self, storage: Any, before: tuple) -> None:
+        """Rows were added behind those that there were at a revision, which are unchanged."""
+        if self._revision == before and self._index is not None and not self.normalize:
+            self._grown, self._revision = True, storage_revision(storage)
 
     def invalidate(self) -> None:
         """Drops the search structure.
@@ -268,6 +278,7 @@ class RetrievalSampler(Sampler):
         Needed after in-place writes on the storage's leaves, which cannot be noticed.
         """
         self._index = self._revision = self._scale = None
+        self._grown = False
 
     # TorchRL's sampler contract
 
@@ -290,7 +301,7 @@ class RetrievalSampler(Sampler):
 
     def __getstate__(self) -> dict[str, Any]:
         state = super().__getstate__()
-        return {**state, "_index": None, "_revision": None, "_scale": None}
+        return {**state, "_index": None, "_revision": None, "_scale": None, "_grown": False}
 
     def __repr__(self) -> str:
         return f"RetrievalSampler({', '.join(f'{k}={v!r}' for k, v in self.config.items())})"
