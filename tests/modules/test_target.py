@@ -13,7 +13,7 @@ from torchrl.data import Composite, LazyMemmapStorage, LazyTensorStorage, Unboun
 from torchrl.envs import Compose, EnvBase, InitTracker, SerialEnv, TransformedEnv
 from torchrl.testing.mocking_classes import ContinuousActionVecMockEnv
 
-from torchrl_rad import ExpertDatabase, RetrievalSampler, RetrievalTargetModule
+from torchrl_rad import ExpertDatabase, GoalReward, RetrievalSampler, RetrievalTargetModule
 from torchrl_rad.modules import target
 
 from ..oracle import target_of
@@ -376,6 +376,91 @@ def test_pickles_small():
 
 
 # a target kept for several steps
+
+
+# a goal of its own for each row
+
+
+def ask_goals(select, states, goals):
+    entries = {"observation": torch.as_tensor(states), "goal": torch.as_tensor(goals)}
+    return select(TensorDict(entries, [len(states)]))
+
+
+def test_goals_by_hand():
+    # there and back: 0 1 2 3 4 5, then 5 4 3 2 1 0
+    states = torch.cat([torch.arange(6.0), torch.arange(5.0, -1.0, -1.0)])[:, None]
+    made = database(episodes(states, [6, 6]), k=4, threshold=0.5, gamma=0.5)
+    reward = GoalReward(radius=0.1)
+    settings = {"rule": "followed", "ahead": 2, "goal_key": "goal", "goal_reward": reward}
+    select = module(made, **settings)
+    assert select.in_keys == ["observation", "goal"]
+    out = ask_goals(select, [[2.0], [2.0], [2.0], [2.0]], [[5.0], [0.0], [3.0], [7.0]])
+    # to 5 along the first episode; to 0 along the second; 3 is one step on; 7 was never reached
+    assert out["target_index"].squeeze(-1).tolist() == [4, 10, 2, -1]
+    assert out["found"].squeeze(-1).tolist() == [True, True, True, False]
+    assert out["target"].squeeze(-1).tolist() == [4.0, 1.0, 2.0, 2.0]
+    # the last row of an episode is where it ends, and its reward that of the state after it
+    assert out["target_return"].squeeze(-1).tolist() == [1.5, 1.5, 1.0, 0.0]
+    assert out["target_offset"].squeeze(-1).tolist() == [1, 0, 0, 0]
+
+
+def test_goals_that_are_none():
+    select = module(database(walks()), goal_key="goal")
+    near = walks()["observation"][20:24, :2]
+    goals = near.clone()
+    goals[1, 0], goals[2, 1] = torch.nan, torch.inf
+    out = ask_goals(select, walks()["observation"][:4], goals)
+    assert out["found"].squeeze(-1).tolist() == [True, False, False, True]
+    state = walks()["observation"][:4].clone()
+    state[0, 0] = torch.nan
+    out = ask_goals(select, state, near)
+    assert out["found"].squeeze(-1).tolist() == [False, True, True, True]
+    assert out["target"].isfinite().all() and out["similarity"][0] == -torch.inf
+
+
+def test_goals_without_a_row_or_a_database():
+    empty = module(database(), goal_key="goal")
+    assert not ask_goals(empty, [[1.0, 2.0]], [[1.0]])["found"].any()
+    select = module(database(walks()), goal_key="goal")
+    out = ask_goals(select, torch.zeros(0, 3), torch.zeros(0, 2))
+    assert out["target"].shape == (0, 3) and out["found"].shape == (0, 1)
+
+
+def test_goals_of_another_width_or_missing():
+    select = module(database(walks()), goal_key="goal")
+    with pytest.raises(ValueError, match="a goal has 4 entries, compared with entries"):
+        ask_goals(select, torch.zeros(1, 3), torch.zeros(1, 4))
+    with pytest.raises(ValueError, match=r"goals are \[3, 2\], of \[1\] states; expected"):
+        select(TensorDict({"observation": torch.zeros(1, 3), "goal": torch.zeros(3, 2)}, []))
+    with pytest.raises(KeyError, match="'goal' is missing in the tensordict"):
+        ask(select, [[0.0, 0.0, 0.0]])
+    with pytest.raises(ValueError, match="tolerance is 0.5; with a goal_key it must be 0"):
+        module(database(), goal_key="goal", tolerance=0.5)
+    with pytest.raises(ValueError, match="goal_reward is given without a goal_key"):
+        module(database(), goal_reward=GoalReward())
+
+
+def test_goals_see_a_database_change():
+    made = database(walks())
+    select, state = module(made, goal_key="goal"), torch.zeros(1, 3)
+    far = torch.full((1, 2), 50.0)
+    assert not ask_goals(select, state, far)["found"].any()
+    steps = episodes(torch.linspace(0, 50, 60)[:, None].expand(60, 3), [60])
+    made.extend(steps)
+    assert ask_goals(select, state, far)["found"].all()
+    made.forget([int(made[:]["episode"][-1])])
+    assert not ask_goals(select, state, far)["found"].any()
+
+
+@pytest.mark.parametrize("most", [1, 7, 39])
+def test_many_goals_are_asked_in_parts(most, monkeypatch):
+    select, states = module(database(walks()), goal_key="goal"), walks(seed=1)["observation"][:40]
+    goals = walks(seed=2)["observation"][:40, :2]
+    expected = ask_goals(select, states, goals)
+    monkeypatch.setattr(target, "QUERIES", most)
+    out = ask_goals(select, states, goals)
+    assert all(torch.equal(out[name], expected[name]) for name in NAMES)
+    assert 0 < expected["found"].sum() < 40
 
 
 class Line(EnvBase):

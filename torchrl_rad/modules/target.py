@@ -205,8 +205,7 @@ class RetrievalTargetModule(TensorDictModuleBase):
             )
         if goals.shape[:-1] != shape:
             raise ValueError(
-                f"goals are {list(goals.shape)}, states {[*shape, '...']}; expected a goal a row, "
-                f"{[*shape, 'G']}."
+                f"goals are {list(goals.shape)}, of {list(shape)} states; expected a goal a row."
             )
         return goals.reshape(shape.numel(), goals.shape[-1])
 

@@ -198,11 +198,14 @@ class GoalTable:
         return number, self.batch[1]
 
     def _joined(self, found: list[_Goal]) -> GoalReturns:
-        count = len(self.last)
-        exact = torch.cat([goal.returns for goal in found])
-        experts = torch.stack([goal.experts for goal in found])
+        count, none = len(self.last), self.last.new_zeros(0)  # also for no goal at all
+        exact = torch.cat([none.double(), *(goal.returns for goal in found)])
+        keys = [number * count + goal.hits for number, goal in enumerate(found)]
+        experts = self.last.new_zeros(len(found), len(self.lengths), dtype=torch.bool)
+        for row, goal in zip(experts, found, strict=True):
+            row.copy_(goal.experts)
         return GoalReturns(
-            torch.cat([number * count + goal.hits for number, goal in enumerate(found)]),
+            torch.cat([none, *keys]),
             WindowMax(exact.float()),
             exact,
             experts,
