@@ -264,7 +264,7 @@ class RetrievalTargetModule(TensorDictModuleBase):
             values, remaining = rows["return_to_go"], rows["remaining"]
             key, gamma = self.database.sampler.key, self.database.gamma
             if self.goal_key is not None:
-                table = GoalTable(rows, key, gamma, self.goal_reward)
+                table = GoalTable(rows, key, gamma, self.goal_reward, self.horizon)
                 ahead = self.ahead if self.rule == "followed" else None
                 rule: TargetRule = GoalRule(table, self.horizon, self.min_offset, ahead)
             elif self.rule == "followed":

@@ -15,7 +15,7 @@ from torchrl_rad.retrieval.sampler import RetrievalSampler
 
 __all__ = ["GoalRule", "goal_followed", "goal_highest", "goal_neighbours"]
 
-MORE = 1.5  # times as many rows are looked at as should hold k of demonstrations
+MORE = 1.25  # times as many rows are looked at as should hold k of demonstrations
 
 
 def goal_neighbours(
@@ -34,8 +34,8 @@ def goal_neighbours(
 
     Yields:
         For n of the queries, in the end for each whose goal somebody reaches: which, int64 [n];
-        rows, int64 [n, C], most similar first; their similarities, float64; and which of them are
-        neighbours, bool, k at most.
+        rows, int64 [n, k], most similar first; their similarities, float64; and which of them are
+        neighbours, bool.
     """
     total = len(returns.last)
     k = min(sampler.k, total)
@@ -51,12 +51,18 @@ def goal_neighbours(
             valid = near >= sampler.threshold
             settled = ~valid[:, -1] | (count == total)
             valid &= returns.experts[goal[part][:, None], returns.episode[rows]]
-            rank = valid.cumsum(-1)
+            rank = valid.cumsum(-1)  # of those that are neighbours; all others go to a last place
             settled |= rank[:, -1] >= k
-            valid &= rank <= k
-            yield part[settled], rows[settled], near[settled], valid[settled]
+            place = torch.where(valid & (rank <= k), rank - 1, k)[settled]
+            yield (
+                part[settled],
+                *(
+                    column.new_zeros(len(place), k + 1).scatter_(1, place, column[settled])[:, :k]
+                    for column in (rows, near, valid)
+                ),
+            )
             unsettled.append(part[~settled])
-        todo, count = torch.cat(unsettled), min(4 * count, total)
+        todo, count = torch.cat(unsettled), min(2 * count, total)
 
 
 def goal_followed(
@@ -123,19 +129,21 @@ class GoalRule:
         """As :meth:`~torchrl_rad.retrieval.rules.TargetRule.choose`."""
         assert goals is not None
         number, returns = self.table.look_up(goals)
-        row, near = (column[:, 0] for column in sampler.nearest(storage, query, 1))
-        target, number = torch.zeros_like(row), number.to(row.device)
-        hit = torch.zeros_like(row, dtype=torch.bool)
+        target, near = torch.zeros_like(number), query.new_zeros(len(query), dtype=torch.float64)
+        row, hit = torch.zeros_like(number), torch.zeros_like(number, dtype=torch.bool)
         for part, rows, nears, valid in goal_neighbours(sampler, storage, query, returns, number):
             asked = (returns, number[part], rows, valid)
             if self.ahead is None:
                 chosen, place = goal_highest(*asked, self.horizon, self.min_offset)
             else:
                 chosen, place = goal_followed(*asked, self.ahead)
-            hit[part] = valid.any(-1)
-            target[part] = torch.where(hit[part], chosen, 0)
-            row[part] = torch.where(hit[part], rows.gather(-1, place)[:, 0], row[part])
-            near[part] = torch.where(hit[part], nears.gather(-1, place)[:, 0], near[part])
+            hit[part] = valid[:, 0]
+            target[part], row[part] = chosen, rows.gather(-1, place)[:, 0]
+            near[part] = nears.gather(-1, place)[:, 0]
+        none = ~hit
+        if none.any():
+            rows, nears = sampler.nearest(storage, query[none], 1)
+            row[none], near[none] = rows[:, 0], nears[:, 0]
         return Choice(target, row, near, hit)
 
     def value(self, rows: Tensor, goals: Tensor | None) -> Tensor:

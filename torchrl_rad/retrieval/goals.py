@@ -155,6 +155,8 @@ class GoalTable:
         key (NestedKey): the state in it.
         gamma (float): discount of the returns.
         reward (GoalReward): when a goal is reached.
+        longest (int, optional): rows of the longest window in which the best is asked for.
+            Defaults to any.
 
     Examples:
         >>> state = torch.tensor([[0.0], [1.0], [2.0], [3.0]])
@@ -170,9 +172,16 @@ class GoalTable:
         tensor([0.2500, 0.5000, 1.0000, 0.0000])
     """
 
-    def __init__(self, rows: TensorDictBase, key: Any, gamma: float, reward: GoalReward):
+    def __init__(
+        self,
+        rows: TensorDictBase,
+        key: Any,
+        gamma: float,
+        reward: GoalReward,
+        longest: int | None = None,
+    ):
         step, remaining = rows["step"], rows["remaining"]
-        self.key, self.gamma, self.reward = key, gamma, reward
+        self.gamma, self.reward, self.longest = gamma, reward, longest
         self.row = torch.arange(len(step), device=step.device)
         self.last = self.row + remaining
         starts = self.row[step == 0]
@@ -206,7 +215,7 @@ class GoalTable:
             row.copy_(goal.experts)
         return GoalReturns(
             torch.cat([none, *keys]),
-            WindowMax(exact.float()),
+            WindowMax(exact.float(), self.longest),
             exact,
             experts,
             (experts * self.lengths).sum(-1).double() / count,
