@@ -19,12 +19,20 @@ from torchrl.data import LazyTensorStorage
 from torchrl_rad import (
     DiffuserLitePlanner,
     ExpertDatabase,
+    GoalReward,
     RetrievalSampler,
     RetrievalTargetModule,
     StepEstimator,
 )
 from torchrl_rad.checkpoint import CheckpointError, verify_manifest, write_json, write_manifest
-from torchrl_rad.policy import FORMAT, build_policy, fit_scales, load_policy, save_policy
+from torchrl_rad.policy import (
+    FORMAT,
+    build_policy,
+    fit_scales,
+    load_policy,
+    save_policy,
+    with_goals,
+)
 
 PLANNER = {
     "horizon": 9,
@@ -239,6 +247,31 @@ def test_description_is_kept(saved):
     assert {key: about[key] for key in ABOUT} == ABOUT
     assert about["format"] == FORMAT
     assert about["database"] == saved[0][0].database.digest()
+
+
+def test_with_goals_nothing_is_trained(database):
+    policy = make_policy(database=database)
+    everything = make_database(seed=3)
+    able = with_goals(policy, everything, goal_reward=GoalReward(0.3))
+    assert able.in_keys == ["observation", "goal"]
+    weights = [p.data_ptr() for p in policy.parameters()]
+    assert [p.data_ptr() for p in able.parameters()] == weights
+    # rows with other goals; one that nobody reaches
+    state = recorded(3)["observation"][:3]
+    goal = recorded(3)["next", "observation"][5:8, :2].clone()
+    goal[2] = 99.0
+    out = able(TensorDict({"observation": state, "goal": goal}, [3]))
+    assert out["found"].squeeze(-1).tolist() == [True, True, False]
+    assert out["action"].shape == (3, 2) and out["action"].isfinite().all()
+    assert able[-1].database is everything and able[-1].candidates == 1
+    # the policy that it was made of is as it was
+    assert policy[-1].database is database and policy[-1].candidates == 2
+    assert act(policy)["found"].any()
+
+
+def test_goals_need_targets():
+    with pytest.raises(ValueError, match="this policy has no targets"):
+        with_goals(make_policy(BACKBONE), make_database())
 
 
 OTHER_PROCESS = """

@@ -10,7 +10,7 @@ from torchrl_rad.modules import *  # noqa: F403
 from torchrl_rad.modules import __all__ as _modules
 from torchrl_rad.objectives import *  # noqa: F403
 from torchrl_rad.objectives import __all__ as _objectives
-from torchrl_rad.policy import build_policy, load_policy, save_policy
+from torchrl_rad.policy import build_policy, load_policy, save_policy, with_goals
 from torchrl_rad.precision import planning_dtype
 from torchrl_rad.retrieval import *  # noqa: F403
 from torchrl_rad.retrieval import __all__ as _retrieval
@@ -26,5 +26,6 @@ __all__ = [
     "planning_dtype",
     "save_policy",
     "train",
+    "with_goals",
 ]
 __all__ += [*_data, *_envs, *_modules, *_objectives, *_retrieval]

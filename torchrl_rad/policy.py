@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import copy
 from pathlib import Path
 from typing import Any
 
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictSequential
+from tensordict.utils import NestedKey
 
 from torchrl_rad.checkpoint import (
     CheckpointError,
@@ -26,8 +28,9 @@ from torchrl_rad.modules.normalizer import Normalizer
 from torchrl_rad.modules.return_model import ReturnModel
 from torchrl_rad.modules.step import StepEstimator
 from torchrl_rad.modules.target import OUT_KEYS, RetrievalTargetModule
+from torchrl_rad.retrieval.goals import GoalReward
 
-__all__ = ["build_policy", "fit_scales", "load_policy", "save_policy"]
+__all__ = ["build_policy", "fit_scales", "load_policy", "save_policy", "with_goals"]
 
 FORMAT = 1
 PLANNER = {"horizon": 129, "jumps": (32, 8, 1), "candidates": 1}  # of DiffuserLitePlanner
@@ -87,6 +90,45 @@ def build_policy(
         database, out_keys=[*OUT_KEYS, "target_offset"], **{**target, "horizon": reach}
     )
     estimator = StepEstimator(states, **{**estimator_options, "horizon": reach})
+    return TensorDictSequential(select, estimator, planner)
+
+
+def with_goals(
+    policy: TensorDictSequential,
+    database: ExpertDatabase,
+    goal_key: NestedKey = "goal",
+    goal_reward: GoalReward | None = None,
+) -> TensorDictSequential:
+    """The same planner on the way to a goal that each row brings along: nothing is trained.
+
+    What the planner and the step estimator learned holds for any goal; the return model belongs to
+    the one it was trained for, so that plans are not ranked by it.
+
+    Args:
+        policy (TensorDictSequential): of :func:`build_policy`, with targets; its weights are
+            shared.
+        database (ExpertDatabase): of all recorded episodes, not only those that reach one goal.
+        goal_key (NestedKey, optional): the goal [*B, G]. Defaults to ``"goal"``.
+        goal_reward (GoalReward, optional): when it is reached. Defaults to within 0.5 of it.
+
+    Raises:
+        ValueError: the policy has no targets.
+    """
+    if len(policy) != 3:
+        raise ValueError("this policy has no targets; goals need one of TS, SE and PL.")
+    select, estimator, planner = policy
+    names = ("horizon", "rule", "ahead", "retrieval_interval", "min_offset")
+    settings = {name: getattr(select, name) for name in names}
+    select = RetrievalTargetModule(
+        database,
+        **settings,
+        goal_key=goal_key,
+        goal_reward=goal_reward,
+        in_keys=select.in_keys[:1],
+        out_keys=select.named_out,
+    )
+    planner = copy.copy(planner)
+    planner.__dict__["database"], planner.candidates = database, 1
     return TensorDictSequential(select, estimator, planner)
 
 

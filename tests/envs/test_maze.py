@@ -243,5 +243,28 @@ def test_rollout_has_one_full_episode_a_row():
     assert torch.equal(td["next", "reward"], near.float())
 
 
+def test_a_goal_for_each_row_is_shown():
+    task = maze_task("medium")
+    cells = [(1, 1), (6, 1), (3, 4)]
+    env = make_maze_env(task, 3, seed=1, goal_cell=cells, show_goal=True)
+    td = env.rollout(5)
+    env.close()
+    goals = torch.tensor([FixedGoalMaze(task, cell).goal.tolist() for cell in cells])
+    assert td["goal"].shape == (3, 5, 2) and td["goal"].dtype == torch.float32
+    assert torch.equal(td["goal"], goals[:, None].expand(3, 5, 2))
+    assert torch.equal(td["next", "goal"], td["goal"])
+    alone = make_maze_env(task, 3, seed=1, goal_cell=(1, 1))
+    state = alone.reset()["observation"]
+    alone.close()
+    assert torch.equal(td["observation"][:, 0], state)
+
+
+def test_as_many_goals_as_rows():
+    with pytest.raises(ValueError, match="there are 2 goal cells for 3 rows; expected one a row"):
+        make_maze_env(maze_task("umaze"), 3, goal_cell=[(1, 1), (1, 2)])
+    with pytest.raises(ValueError, match="is a wall or outside the map"):
+        make_maze_env(maze_task("umaze"), 2, goal_cell=[(1, 1), (9, 9)])
+
+
 if __name__ == "__main__":
     pytest.main([__file__])

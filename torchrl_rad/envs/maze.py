@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import gymnasium as gym
@@ -82,6 +84,8 @@ class FixedGoalMaze(gym.Wrapper):
         task (MazeTask): the protocol.
         goal_cell (tuple of int, optional): another goal cell (row, column).
         reset_cell (tuple of int, optional): a fixed start cell instead of a uniform one.
+        show_goal (bool, optional): the observation is a dict of ``observation``, the state, and
+            ``goal``, x and y of the goal. Defaults to ``False``.
 
     Raises:
         ValueError: a cell is no (row, column), a wall, or outside the map.
@@ -98,6 +102,7 @@ class FixedGoalMaze(gym.Wrapper):
         task: MazeTask,
         goal_cell: tuple[int, int] | None = None,
         reset_cell: tuple[int, int] | None = None,
+        show_goal: bool = False,
     ):
         gym.register_envs(gymnasium_robotics)
         super().__init__(gym.make(task.env_id, max_episode_steps=task.max_steps))
@@ -116,7 +121,11 @@ class FixedGoalMaze(gym.Wrapper):
                     f"cell {tuple(cell.tolist())} of {task.env_id} is a wall or outside the map."
                 )
         self.goal = self.maze.cell_rowcol_to_xy(self.goal_cell)
-        self.observation_space = gym.spaces.Box(-np.inf, np.inf, (4,), np.float32)
+        self.show_goal = show_goal
+        state = gym.spaces.Box(-np.inf, np.inf, (4,), np.float32)
+        goal = gym.spaces.Box(-np.inf, np.inf, (2,), np.float32)
+        both = gym.spaces.Dict({"observation": state, "goal": goal})
+        self.observation_space = both if show_goal else state
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None):
         if seed is not None:
@@ -124,13 +133,18 @@ class FixedGoalMaze(gym.Wrapper):
         cell = self.reset_cells[self.unwrapped.np_random.integers(len(self.reset_cells))]
         cells = {"goal_cell": self.goal_cell, "reset_cell": cell}
         observation, _ = self.env.reset(options=cells)
-        return self.adapter(observation), {}
+        return self._seen(self.adapter(observation)), {}
 
     def step(self, action):
         observation, _, terminated, truncated, _ = self.env.step(action)
         state = self.adapter(observation)
         reward = float(np.linalg.norm(state[:2] - self.goal) <= GOAL_RADIUS)
-        return state, reward, terminated, truncated, {}
+        return self._seen(state), reward, terminated, truncated, {}
+
+    def _seen(self, state: np.ndarray) -> Any:
+        if not self.show_goal:
+            return state
+        return {"observation": state, "goal": self.goal.astype(np.float32)}
 
 
 def _cell(name: str, value: Any) -> np.ndarray:
@@ -176,7 +190,11 @@ def relabel_goal(episodes: TensorDictBase, goal: np.ndarray | Tensor) -> TensorD
 
 
 def make_maze_env(
-    task: MazeTask, rows: int, seed: int = 0, goal_cell: tuple[int, int] | None = None
+    task: MazeTask,
+    rows: int,
+    seed: int = 0,
+    goal_cell: tuple[int, int] | Sequence[tuple[int, int]] | None = None,
+    show_goal: bool = False,
 ) -> TransformedEnv:
     """A TorchRL environment with ``rows`` independent mazes.
 
@@ -186,10 +204,13 @@ def make_maze_env(
         task (MazeTask): the protocol.
         rows (int): number of mazes.
         seed (int, optional): seed of the start states. Defaults to ``0``.
-        goal_cell (tuple of int, optional): another goal cell.
+        goal_cell (tuple of int, optional): another goal cell, or a list of one a row.
+        show_goal (bool, optional): write x and y of each row's goal into ``goal`` [rows, 2].
+            Defaults to ``False``.
 
     Raises:
-        ValueError: ``rows`` is below 1, or the goal cell cannot be stood on.
+        ValueError: ``rows`` is below 1, there are more or fewer goal cells than rows, or one that
+            cannot be stood on.
 
     Examples:
         >>> env = make_maze_env(maze_task("umaze"), 2)
@@ -199,10 +220,18 @@ def make_maze_env(
     if rows < 1:
         raise ValueError(f"rows is {rows}; an environment has at least one row.")
 
-    def make_row() -> TransformedEnv:
-        # the cast sits inside each row: outside a batched env it breaks partial steps
-        return TransformedEnv(GymWrapper(FixedGoalMaze(task, goal_cell)), DoubleToFloat())
+    several = isinstance(goal_cell, list)
+    cells: Any = goal_cell if several else [goal_cell] * rows
+    if len(cells) != rows:
+        raise ValueError(f"there are {len(cells)} goal cells for {rows} rows; expected one a row.")
 
-    env = TransformedEnv(SerialEnv(rows, make_row), Compose(InitTracker()))
+    def make_row(cell: Any) -> TransformedEnv:
+        # the cast sits inside each row: outside a batched env it breaks partial steps
+        maze = FixedGoalMaze(task, cell, show_goal=show_goal)
+        return TransformedEnv(GymWrapper(maze), DoubleToFloat())
+
+    env = TransformedEnv(
+        SerialEnv(rows, [partial(make_row, cell) for cell in cells]), Compose(InitTracker())
+    )
     env.set_seed(seed)
     return env
