@@ -11,7 +11,16 @@ from tensordict import TensorDict
 from torchrl.data import LazyTensorStorage
 
 from torchrl_rad import ExpertDatabase, RetrievalSampler, maze_task
-from torchrl_rad.plots import GOAL, PLAN, TARGET, WALL, plot_curves, plot_targets
+from torchrl_rad.plots import (
+    GOAL,
+    PATH,
+    PLAN,
+    TARGET,
+    WALL,
+    plot_curves,
+    plot_followed,
+    plot_targets,
+)
 from torchrl_rad.policy import build_policy
 
 matplotlib = pytest.importorskip("matplotlib")
@@ -217,6 +226,35 @@ def test_without_matplotlib(tmp_path, monkeypatch, backbone, draw):
             plot_targets(TASK, {"a": episodes(None)}, {"a": backbone}, {"a": "a"}, tmp_path / "t")
     assert 'plots need matplotlib: pip install "torchrl_rad[recipes]"' in str(caught.value)
     assert list(tmp_path.iterdir()) == []
+
+
+# what was followed
+
+
+def test_followed_demonstrations(tmp_path):
+    # UMaze: along the bottom, up the right side; the path drives beside it, and falls back once
+    way = torch.stack([torch.linspace(-1, 1, 30), torch.full((30,), -1.0)], -1)
+    states = torch.cat([way, torch.zeros(30, 2)], -1)
+    done = torch.zeros(30, 1, dtype=torch.bool)
+    done[-1] = True
+    steps = {"observation": states, "next": {"reward": done.float(), "done": done}}
+    database = ExpertDatabase(LazyTensorStorage(40), sampler=RetrievalSampler("euclidean"))
+    database.extend(TensorDict(steps, [30]))
+    source = torch.stack([torch.zeros(30), torch.arange(30.0)], -1).long()
+    found = torch.ones(30, 1, dtype=torch.bool)
+    found[3], source[3] = False, -1
+    driven = {
+        "observation": states + torch.tensor([0.0, 0.2, 0.0, 0.0]),
+        "found": found,
+        "target_source": source,
+        "next": {"done": done, "reward": done.float()},
+    }
+    for name in ("similarity", "target_return", "target_offset", "target_step"):
+        driven[name] = torch.zeros(30, 1, dtype=torch.int64)
+    plot_followed(TASK, TensorDict(driven, [30])[None], database, 0, tmp_path / "followed.png")
+    image = picture(tmp_path / "followed.png")
+    assert count(image, TARGET, 2) > 100 and count(image, PATH, 2) > 100
+    assert count(image, WALL) > 10_000 and count(image, PLAN, 60) > 50
 
 
 if __name__ == "__main__":

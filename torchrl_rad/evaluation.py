@@ -16,7 +16,10 @@ from torchrl.envs import EnvBase
 
 __all__ = ["episode_results", "evaluate", "interval", "measure_latency", "summarise"]
 
-KEPT = ("observation", "target", "found", "similarity", "target_index", "target_step")
+KEPT = (
+    "observation", "goal", "target", "found", "similarity", "target_return", "target_index",
+    "target_offset", "target_source", "target_step",
+)  # fmt: skip
 
 
 def evaluate(

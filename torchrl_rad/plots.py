@@ -11,9 +11,11 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictSequential
 
+from torchrl_rad.data.database import ExpertDatabase
 from torchrl_rad.envs.maze import GOAL_RADIUS, FixedGoalMaze, MazeTask
+from torchrl_rad.provenance import provenance
 
-__all__ = ["plot_curves", "plot_targets"]
+__all__ = ["plot_curves", "plot_followed", "plot_targets"]
 
 WALL, PATH, TARGET, PLAN, GOAL = "#d9d9de", "#4c72b0", "#dd8452", "#55a868", "#c44e52"
 PATHS = 16  # episodes drawn
@@ -99,6 +101,56 @@ def plot_targets(
         unique.values(), unique.keys(), loc="lower center", ncol=6, fontsize=9, frameon=False
     )
     figure.tight_layout(rect=(0, 0.08, 1, 1))
+    figure.savefig(path, dpi=130)
+    pyplot.close(figure)
+    env.close()
+
+
+def plot_followed(
+    task: MazeTask,
+    steps: TensorDictBase,
+    database: ExpertDatabase,
+    row: int,
+    path: str | Path,
+    goal_cell: tuple[int, int] | None = None,
+) -> None:
+    """Draws one episode's path over the demonstrations that it followed.
+
+    Args:
+        task (MazeTask): the maze.
+        steps (TensorDictBase): [n, T], with ``target_source``.
+        database (ExpertDatabase): the demonstrations.
+        row (int): which of the n episodes.
+        path (path): a png.
+        goal_cell (tuple of int, optional): another goal than the task's.
+
+    Raises:
+        ImportError: matplotlib is not installed.
+        KeyError: the policy wrote no sources.
+    """
+    pyplot = _pyplot()
+    env = FixedGoalMaze(task, goal_cell)
+    columns = provenance(steps[row : row + 1])
+    used = np.unique(columns["episode"][columns["found"]])
+    rows, width = len(env.maze.maze_map), len(env.maze.maze_map[0])
+    figure, axis = pyplot.subplots(figsize=(5.0, 5.0 * rows / width + 0.7))
+    _draw_maze(axis, env)
+    recorded = database[:]
+    for episode in used:
+        own = recorded["observation"][recorded["episode"] == int(episode), :2].cpu().numpy()
+        axis.plot(*own.T, color=PLAN, lw=0.5, alpha=0.35, label="demonstrations")
+        at = columns["episode_step"][columns["episode"] == episode]
+        axis.plot(*own[at].T, ".", color=TARGET, ms=4, label="where they were followed")
+    x, y = steps["observation"][row, : len(columns["step"]), :2].cpu().numpy().T
+    axis.plot(x, y, color=PATH, lw=1.6, label="path driven")
+    axis.plot(x[0], y[0], ".", color="black", ms=7, label="start")
+    handles, labels = axis.get_legend_handles_labels()
+    unique = dict(zip(labels, handles, strict=True))
+    figure.legend(
+        unique.values(), unique.keys(), loc="lower center", ncol=3, fontsize=9, frameon=False
+    )
+    axis.set_title(f"{len(used)} demonstrations followed in {len(x)} steps", fontsize=10)
+    figure.tight_layout(rect=(0, 0.09, 1, 1))
     figure.savefig(path, dpi=130)
     pyplot.close(figure)
     env.close()

@@ -87,7 +87,9 @@ def build_policy(
     if database is None:
         raise ValueError("this policy retrieves targets: pass the database.")
     select = RetrievalTargetModule(
-        database, out_keys=[*OUT_KEYS, "target_offset"], **{**target, "horizon": reach}
+        database,
+        out_keys=[*OUT_KEYS, "target_offset", "target_source"],
+        **{**target, "horizon": reach},
     )
     estimator = StepEstimator(states, **{**estimator_options, "horizon": reach})
     return TensorDictSequential(select, estimator, planner)

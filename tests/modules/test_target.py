@@ -305,8 +305,8 @@ def test_wrong_width():
         ({"min_offset": 17}, "min_offset is 17; expected 0 to horizon - 1 = 16"),
         ({"min_offset": -1}, "min_offset is -1"),
         ({"retrieval_interval": 0}, "retrieval_interval is 0; expected 1 or more"),
-        ({"in_keys": ["a", "b"]}, "expected one in_key and five or six out_keys"),
-        ({"out_keys": ["a"]}, "expected one in_key and five or six out_keys"),
+        ({"in_keys": ["a", "b"]}, "expected one in_key and five to seven out_keys"),
+        ({"out_keys": ["a"]}, "expected one in_key and five to seven out_keys"),
     ],
 )
 def test_wrong_settings(settings, message):

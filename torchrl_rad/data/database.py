@@ -289,6 +289,14 @@ class ExpertDatabase(SavedReplayBuffer):
                 self._remove(gone)
             return int(gone.sum())
 
+    def keep(self, episodes: Iterable[int]) -> int:
+        """Removes all demonstrations but these; see :meth:`forget`."""
+        wanted = {int(number) for number in episodes}
+        known = set(self._storage[:]["episode"].tolist()) if len(self) else set()
+        if wanted - known:
+            raise KeyError(f"episodes {sorted(wanted - known)} are not in the database.")
+        return self.forget(known - wanted)
+
     def _remove(self, gone: Tensor) -> None:
         """Closes the gaps that some rows, bool [N], leave."""
         if type(self._storage) is TensorStorage:

@@ -70,6 +70,8 @@ class RetrievalTargetModule(TensorDictModuleBase):
     ``target_index``    [*B, 1] int64             row of the database; -1 if none was found
     ``target_offset``   [*B, 1] int64, on demand  recorded steps from that neighbour to the target;
                                                   0 if none
+    ``target_source``   [*B, 2] int64, on demand  episode and step of that neighbour, of which the
+                                                  target is ``target_offset`` further on; -1 if none
     ==================  ========================  ==================================================
 
     Args:
@@ -90,7 +92,7 @@ class RetrievalTargetModule(TensorDictModuleBase):
         goal_reward (GoalReward, optional): when a goal is reached. Defaults to within 0.5 of it.
         in_keys (sequence of NestedKey, optional): the state. Defaults to ``["observation"]``.
         out_keys (sequence of NestedKey, optional): new names, in the order of the table; a sixth
-            one asks for the offset.
+            one asks for the offset, a seventh one for the source.
 
     Raises:
         ValueError: an argument has a value that it cannot have.
@@ -144,9 +146,9 @@ class RetrievalTargetModule(TensorDictModuleBase):
             )
         if retrieval_interval < 1:
             raise ValueError(f"retrieval_interval is {retrieval_interval}; expected 1 or more.")
-        if len(in_keys) != 1 or len(out_keys) not in (5, 6):
+        if len(in_keys) != 1 or len(out_keys) not in (5, 6, 7):
             raise ValueError(
-                f"expected one in_key and five or six out_keys, got {in_keys} and {out_keys}."
+                f"expected one in_key and five to seven out_keys, got {in_keys} and {out_keys}."
             )
         if goal_key is not None and tolerance > 0:
             raise ValueError(f"tolerance is {tolerance}; with a goal_key it must be 0.")
@@ -190,11 +192,22 @@ class RetrievalTargetModule(TensorDictModuleBase):
                 index, similarity, offset = self.select(query, goals)
             hit = index >= 0
             target, value = self._read(query, goals, index, hit)
-        results = (target, hit, similarity, value, index, offset)
+            results = [target, hit, similarity, value, index, offset]
+            if len(self.named_out) == 7:
+                results.append(self._source(index, offset, hit))
         for key, result in zip(self.named_out, results, strict=False):
-            width = target.shape[-1] if result is target else 1
+            width = result.shape[-1] if result.ndim == 2 else 1
             tensordict.set(key, result.reshape(*shape, width))
         return tensordict
+
+    def _source(self, index: Tensor, offset: Tensor, hit: Tensor) -> Tensor:
+        """Episode and step of the neighbours through which targets were reached, [Q, 2]."""
+        if not bool(hit.any()):
+            return index.new_full((len(index), 2), -1)
+        rows = self.database[:]
+        place = (index - offset).clamp_min(0).to(self.database.device)
+        columns = [rows[name].index_select(0, place).to(index) for name in ("episode", "step")]
+        return torch.where(hit[:, None], torch.stack(columns, -1), -1)
 
     def _goals(self, tensordict: TensorDictBase, shape: torch.Size) -> Tensor:
         goals = tensordict.get(self.goal_key, None)
