@@ -1,6 +1,7 @@
-"""Scores a saved policy on its task.
+"""Scores a saved policy on its task, or on the way to other goals, for which nothing is trained.
 
 python recipes/evaluate.py outputs/pointmaze-umaze/<run>/policies/followed --episodes 100
+python recipes/evaluate.py outputs/pointmaze-umaze/<run>/policies/followed --goals 3,1 1,3 3,3
 """
 
 from __future__ import annotations
@@ -8,42 +9,91 @@ from __future__ import annotations
 import argparse
 import logging
 import sys
+from pathlib import Path
 
 import torch
+from tensordict.nn import TensorDictSequential
 from torchrl._utils import logger as torchrl_logger
 
-from torchrl_rad import make_maze_env, maze_task
+from torchrl_rad import ExpertDatabase, make_maze_env, maze_task, with_goals
 from torchrl_rad.checkpoint import CheckpointError, read_json
-from torchrl_rad.experiment import collect_episodes, policy_row
+from torchrl_rad.experiment import collect_episodes, make_data, make_database, policy_row
 from torchrl_rad.policy import load_policy
 from torchrl_rad.precision import planning_dtype
+from torchrl_rad.provenance import write_provenance
 from torchrl_rad.results import format_table, score_source
+from torchrl_rad.runs import RunFolder
 
 torchrl_logger.setLevel(logging.WARNING)
 
 
-def main() -> None:
-    """Reads the command line; errors that a user can mend end in one line."""
-    parser = argparse.ArgumentParser(description="Scores a saved policy on its task.")
+def cell(text: str) -> tuple[int, int]:
+    """``"3,1"`` -> (3, 1)."""
+    row, column = text.split(",")
+    return int(row), int(column)
+
+
+def parse() -> argparse.Namespace:
+    """The command line."""
+    parser = argparse.ArgumentParser(description="Scores a saved policy.")
     parser.add_argument("folder", help="policy folder, such as <run folder>/policies/followed")
-    parser.add_argument("--episodes", type=int, default=100, help="rows, one episode each")
+    parser.add_argument("--episodes", type=int, default=100, help="of each goal, one a row")
     parser.add_argument("--seed", type=int, default=10_000, help="of start states and noise")
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--precision", default="auto", choices=("auto", "bf16", "fp16", "fp32"))
-    arguments = parser.parse_args()
+    parser.add_argument(
+        "--goals", type=cell, nargs="+", metavar="ROW,COLUMN", help="goal cells in place of its own"
+    )
+    parser.add_argument(
+        "--database", help="folder of the demonstrations; with --goals all steps that the run "
+        "recorded are searched by default"
+    )  # fmt: skip
+    parser.add_argument("--csv", help="file for what was followed at each step")
+    return parser.parse_args()
+
+
+def recorded_steps(folder: Path, like: ExpertDatabase) -> ExpertDatabase:
+    """All episodes that the policy's run recorded, searched as its own database is."""
+    _, data = make_data(RunFolder.open(folder.absolute().parents[1]).config())
+    return make_database(data, {"gamma": like.gamma, "sampler": like.sampler.config})
+
+
+def load(arguments: argparse.Namespace) -> TensorDictSequential:
+    """The policy with the database and the goals asked for."""
+    other = arguments.database and ExpertDatabase.loads(arguments.database)
+    policy = load_policy(arguments.folder, other)
+    if not arguments.goals:
+        return policy
+    if len(policy) == 1:
+        raise ValueError(f"the policy in {arguments.folder} retrieves nothing: it has no goals.")
+    database = other or recorded_steps(Path(arguments.folder), policy[0].database)
+    return with_goals(policy, database)
+
+
+def main() -> None:
+    """Reads the command line; errors that a user can mend end in one line."""
+    arguments = parse()
     torch.set_num_threads(arguments.threads)
+    goals, count = arguments.goals or [None], arguments.episodes
     try:
-        policy = load_policy(arguments.folder)
+        policy = load(arguments)
         task = maze_task(read_json(f"{arguments.folder}/policy.json")["maze"])
-        if arguments.episodes < 1:
-            raise ValueError(f"--episodes is {arguments.episodes}; at least one is needed.")
+        if count < 1:
+            raise ValueError(f"--episodes is {count}; at least one is needed.")
+        cells = [goal for goal in goals for _ in range(count)]
+        env = make_maze_env(task, len(cells), goal_cell=cells, show_goal=bool(arguments.goals))
     except (CheckpointError, FileNotFoundError, KeyError, ValueError) as error:
         sys.exit(f"error: {error.args[0] if isinstance(error, KeyError) else error}")
-    env = make_maze_env(task, arguments.episodes)
     dtype = planning_dtype(arguments.precision)
     steps = collect_episodes(env, policy, task.max_steps, arguments.seed, task.name, dtype)
-    print(format_table({task.name: policy_row(task, policy, steps)}))
+    names = [task.name if goal is None else f"{task.name} {goal}" for goal in goals]
+    parts = dict(zip(names, steps.split(count), strict=True))
+    print(format_table({name: policy_row(task, policy, part) for name, part in parts.items()}))
     print(f"\n{score_source(task)}")
+    if arguments.goals:
+        print("these are of the task's own goal; plans were not ranked: the return model is of it")
+    if arguments.csv:
+        write_provenance(arguments.csv, steps)
 
 
 if __name__ == "__main__":

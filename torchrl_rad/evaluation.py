@@ -150,7 +150,11 @@ def summarise(
 
 
 def measure_latency(
-    policy: TensorDictSequential, states: Tensor, rows: int, calls: int = 50
+    policy: TensorDictSequential,
+    states: Tensor,
+    rows: int,
+    calls: int = 50,
+    goals: Tensor | None = None,
 ) -> dict[str, dict[str, float]]:
     """Time of each module of a policy on recorded states, in milliseconds.
 
@@ -160,6 +164,7 @@ def measure_latency(
             as in acting, on the policy's device.
         rows (int): states of a call, at most n.
         calls (int, optional): timed calls, after five that are not. Defaults to ``50``.
+        goals (Tensor, optional): [n, G], of a policy that reads ``goal``.
 
     Returns:
         For each module (named by its class) and ``"total"``: ``p50`` and ``p95``.
@@ -170,6 +175,8 @@ def measure_latency(
     spent = np.zeros((calls + 5, len(names)))
     for call in range(calls + 5):
         tensordict = TensorDict({"observation": states[:rows, call % states.shape[1]]}, [rows])
+        if goals is not None:
+            tensordict.set("goal", goals[:rows].to(states.device))
         for number, module in enumerate(policy.module):
             begin = time.perf_counter()
             with torch.no_grad():

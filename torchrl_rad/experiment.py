@@ -305,7 +305,8 @@ def policy_row(
     torch.set_num_threads(1)
     latency = {}
     for count in (1, min(50, len(steps))):
-        latency[str(count)] = measure_latency(policy, steps["observation"], count)
+        goals = steps["goal"][:, 0] if "goal" in steps.keys() else None
+        latency[str(count)] = measure_latency(policy, steps["observation"], count, goals=goals)
     torch.set_num_threads(threads)
     row["latency_ms"] = latency
     for part, module in PARTS.items():
