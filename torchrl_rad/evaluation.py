@@ -17,8 +17,8 @@ from torchrl.envs import EnvBase
 __all__ = ["episode_results", "evaluate", "interval", "measure_latency", "summarise"]
 
 KEPT = (
-    "observation", "goal", "target", "found", "similarity", "target_return", "target_index",
-    "target_offset", "target_source", "target_step",
+    "observation", "goal", "action", "target", "found", "similarity", "target_return",
+    "target_index", "target_offset", "target_source", "target_step",
 )  # fmt: skip
 
 

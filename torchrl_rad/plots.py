@@ -13,9 +13,10 @@ from tensordict.nn import TensorDictSequential
 
 from torchrl_rad.data.database import ExpertDatabase
 from torchrl_rad.envs.maze import GOAL_RADIUS, FixedGoalMaze, MazeTask
+from torchrl_rad.evaluation import interval
 from torchrl_rad.provenance import provenance
 
-__all__ = ["plot_curves", "plot_followed", "plot_targets"]
+__all__ = ["plot_curves", "plot_followed", "plot_growth", "plot_targets"]
 
 WALL, PATH, TARGET, PLAN, GOAL = "#d9d9de", "#4c72b0", "#dd8452", "#55a868", "#c44e52"
 PATHS = 16  # episodes drawn
@@ -60,6 +61,38 @@ def plot_curves(rows: Sequence[Mapping[str, float]], path: str | Path) -> None:
         axis.grid(alpha=0.3)
         axis.legend(fontsize=7, frameon=False)
     figure.tight_layout()
+    figure.savefig(path, dpi=130)
+    pyplot.close(figure)
+
+
+def plot_growth(rounds: Sequence[Mapping[str, Any]], path: str | Path) -> None:
+    """Draws the score of a growing database against the episodes seen.
+
+    Args:
+        rounds (sequence of mapping): each ``seen``, episodes before it; ``demonstrations``; and
+            ``scores`` of its episodes, of which mean and 95 % interval are drawn.
+        path (path): a png.
+
+    Raises:
+        ImportError: matplotlib is not installed.
+    """
+    pyplot = _pyplot()
+    seen = [entry["seen"] for entry in rounds]
+    centre, half = np.array([interval(entry["scores"]) for entry in rounds]).T
+    figure, axis = pyplot.subplots(figsize=(5.0, 3.2))
+    axis.fill_between(seen, centre - half, centre + half, color=PATH, alpha=0.2, lw=0)
+    axis.plot(seen, centre, ".-", color=PATH, label="score")
+    axis.set(xlabel="episodes seen", ylabel="score")
+    other = axis.twinx()
+    held = [entry["demonstrations"] for entry in rounds]
+    other.plot(seen, held, "--", color=TARGET, lw=1.2, label="demonstrations")
+    other.set(ylabel="demonstrations in the database", ylim=(0, None))
+    lines = [*axis.get_lines(), *other.get_lines()]
+    figure.legend(
+        lines, [str(x.get_label()) for x in lines], loc="lower center", ncol=2, frameon=False
+    )
+    axis.grid(alpha=0.3)
+    figure.tight_layout(rect=(0, 0.07, 1, 1))
     figure.savefig(path, dpi=130)
     pyplot.close(figure)
 
