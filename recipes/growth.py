@@ -123,7 +123,8 @@ def main() -> None:
     except (CheckpointError, OSError, KeyError, ValueError) as error:
         sys.exit(f"error: {error.args[0] if isinstance(error, KeyError) else error}")
     rounds = grow(arguments, policy, database, task)
-    write_json(out / "results.json", {"rounds": rounds, **vars(arguments), **environment_facts()})
+    facts = {"settings": vars(arguments), **environment_facts()}
+    write_json(out / "results.json", {"rounds": rounds, **facts})
     plot_growth(rounds, out / "growth.png")
     print(f"\n{out / 'results.json'}, {out / 'growth.png'}")
 

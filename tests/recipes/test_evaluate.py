@@ -118,5 +118,63 @@ def test_no_folder():
     assert "the following arguments are required: folder" in err
 
 
+# other goals
+
+
+def test_goals_without_training(whole, tmp_path):
+    policy = whole[0].path / "policies" / "followed"
+    csv = tmp_path / "followed.csv"
+    lines = score(policy, "--episodes", "2", "--goals", "3,1", "1,3", "--csv", str(csv))
+    rows = [[cell.strip() for cell in line.split("|")][1] for line in lines[2:4]]
+    assert rows == ["umaze (3, 1)", "umaze (1, 3)"]
+    assert "the return model is of it" in lines[-1]
+    followed = csv.read_text().splitlines()
+    assert followed[0].startswith("row,step,found,episode,episode_step,target_step,similarity")
+    assert len(followed) == 1 + 4 * 300 and {line.split(",")[2] for line in followed[1:]} == {
+        "0",
+        "1",
+    }
+
+
+def test_another_database(whole, folder):
+    run, _ = whole
+    policy, other = run.path / "policies" / "followed", folder / "database"
+    lines = score(policy, "--episodes", "1", "--database", str(other))
+    own = score(policy, "--episodes", "1")
+    assert columns(lines)["similarity"] != columns(own)["similarity"]
+    goals = score(policy, "--episodes", "1", "--goals", "3,1", "--database", str(other))
+    assert "umaze (3, 1)" in goals[2]
+
+
+@pytest.mark.parametrize(
+    "options, message",
+    [
+        (["--goals", "0,0"], "cell (0, 0) of PointMaze_UMaze-v3 is a wall or outside the map"),
+        (["--goals", "9,9"], "cell (9, 9) of PointMaze_UMaze-v3 is a wall or outside the map"),
+        (["--database", "nowhere"], "nowhere holds no database"),
+        (["--episodes", "0"], "--episodes is 0; at least one is needed"),
+    ],
+)
+def test_settings_that_are_none(whole, options, message):
+    code, out, _ = call(whole[0].path / "policies" / "followed", "--episodes", "1", *options)
+    assert code.startswith("error: ") and message in code and out == ""
+
+
+def test_goals_of_a_policy_without_targets(whole):
+    code, _, _ = call(whole[0].path / "policies" / "backbone", "--goals", "3,1")
+    assert "retrieves nothing: it has no goals" in code
+
+
+def test_goals_of_a_policy_without_its_run(folder):
+    code, _, _ = call(folder, "--goals", "3,1")
+    assert "holds no run: config.json is missing" in code
+
+
+@pytest.mark.parametrize("text", ["3", "a,b", "1,2,3"])
+def test_a_goal_that_is_no_cell(folder, text):
+    code, _, err = call(folder, "--goals", text)
+    assert code == 2 and f"argument --goals: invalid cell value: '{text}'" in err
+
+
 if __name__ == "__main__":
     raise SystemExit(pytest.main([__file__]))
