@@ -1,5 +1,6 @@
 """Planning with retrieved demonstrations (RAD) as TorchRL modules."""
 
+from torchrl_rad.calibration import similarity_threshold
 from torchrl_rad.checkpoint import Checkpointer, CheckpointError
 from torchrl_rad.data import *  # noqa: F403
 from torchrl_rad.data import __all__ as _data
@@ -25,6 +26,7 @@ __all__ = [
     "load_policy",
     "planning_dtype",
     "save_policy",
+    "similarity_threshold",
     "train",
     "with_goals",
 ]

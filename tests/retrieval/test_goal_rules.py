@@ -6,11 +6,20 @@ from tensordict import TensorDict
 from torchrl.data import LazyTensorStorage
 
 from torchrl_rad import ExpertDatabase, GoalReward, RetrievalSampler, RetrievalTargetModule
-from torchrl_rad.retrieval import goal_rules
+from torchrl_rad.retrieval import goal_rules, goals
 from torchrl_rad.retrieval.goal_rules import goal_neighbours
 from torchrl_rad.retrieval.goals import GoalTable
 
 from ..oracle import for_goal, neighbours, ranking, target_of
+
+
+@pytest.fixture(scope="module", autouse=True, params=[0, goals.SUBSET_ROWS], ids=["all", "own"])
+def searched(request):
+    """All rows are searched, or for each goal those of its demonstrations."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(goals, "SUBSET_ROWS", request.param)
+        yield request.param > 0
+
 
 NAMES = ["target", "found", "similarity", "target_return", "target_index", "target_offset"]
 RULES = {
@@ -148,12 +157,12 @@ def test_neighbours_are_of_demonstrations(monkeypatch, more, threshold):
     monkeypatch.setattr(goal_rules, "MORE", more)
     database, _ = walk(threshold=threshold)
     table = GoalTable(database[:], "observation", 0.9, GoalReward(0.5))
-    goals = torch.rand(6, 2, generator=torch.Generator().manual_seed(1)) * 4
-    number, returns = table.look_up(goals)
+    wanted = torch.rand(6, 2, generator=torch.Generator().manual_seed(1)) * 4
+    number, returns = table.look_up(wanted)
     query = database[:]["observation"][::100] + 0.01
-    queries, goal = query.repeat(len(goals), 1), number.repeat_interleave(len(query))
+    queries, goal = query.repeat(len(wanted), 1), number.repeat_interleave(len(query))
     answers = {}
-    asked = (database.sampler, database.storage, queries, returns, goal)
+    asked = (database.sampler, database.storage, queries, table, returns, goal)
     for part, rows, near, valid in goal_neighbours(*asked):
         for i, number in enumerate(part.tolist()):
             assert number not in answers
@@ -197,3 +206,23 @@ def test_the_goal_of_another_row_does_not_show():
     assert out["found"].squeeze(-1).tolist() == [True, False]
     assert torch.equal(out["target"][1], state[1]) and out["target_index"][1] == -1
     assert out["target_return"][1] == 0.0 and 0 < out["similarity"][1] <= 1
+
+
+def test_few_rows_are_held_for_goals(monkeypatch):
+    database, following = walk()
+    table = GoalTable(database[:], "observation", 0.9, GoalReward(0.5))
+    _, returns = table.look_up(following[::60])
+    sizes = (returns.share * len(following)).round().long().tolist()
+    monkeypatch.setattr(goals, "SUBSET_ROWS", sizes[0] + sizes[1])
+    made = []
+
+    def make(rows):
+        made.append(len(rows))
+        return database.sampler.subset(database.storage, rows)
+
+    for i in (0, 1, 0, 1):
+        table.subset(i, make)
+    assert made == sizes[:2]
+    table.subset(2, make)
+    assert made == sizes[:3]
+    assert sum(len(rows) for rows, _ in table.subsets.values()) <= sum(sizes[:2])

@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchrl_rad.retrieval import search
+from torchrl_rad.retrieval import goals, search
 from torchrl_rad.retrieval.goals import GoalReturns, GoalTable
 from torchrl_rad.retrieval.rules import Choice
 from torchrl_rad.retrieval.sampler import RetrievalSampler
@@ -18,30 +18,53 @@ __all__ = ["GoalRule", "goal_followed", "goal_highest", "goal_neighbours"]
 MORE = 1.25  # times as many rows are looked at as should hold k of demonstrations
 
 
+Found = tuple[Tensor, Tensor, Tensor, Tensor]
+
+
 def goal_neighbours(
-    sampler: RetrievalSampler, storage: Any, query: Tensor, returns: GoalReturns, goal: Tensor
-) -> Iterator[tuple[Tensor, Tensor, Tensor, Tensor]]:
+    sampler: RetrievalSampler,
+    storage: Any,
+    query: Tensor,
+    table: GoalTable,
+    returns: GoalReturns,
+    goal: Tensor,
+) -> Iterator[Found]:
     """The neighbours of queries among the rows of demonstrations for their goals.
 
-    As many of the nearest rows are looked at as hold k of them, or all that are similar enough.
+    Each goal gets a search structure of those rows, as long as they are SUBSET_ROWS at most for all
+    goals together. Beyond, as many of the nearest of all rows are looked at as hold k of them.
 
     Args:
         sampler (RetrievalSampler): finds the rows.
         storage (Storage): where they are.
         query (Tensor): [Q, S] in raw units.
-        returns (GoalReturns): of the goals.
-        goal (Tensor): int64 [Q], which goal each query has.
+        table, returns: the table, and what it gave for the goals.
+        goal (Tensor): int64 [Q], which of them each query has.
 
     Yields:
         For n of the queries, in the end for each whose goal somebody reaches: which, int64 [n];
         rows, int64 [n, k], most similar first; their similarities, float64; and which of them are
         neighbours, bool.
     """
-    total = len(returns.last)
-    k = min(sampler.k, total)
     todo = (returns.share[goal] > 0).nonzero()[:, 0]
     if len(todo) == 0:
         return
+    share = float(returns.share[goal[todo].unique()].sum())
+    within = _in_subsets if share * len(returns.last) <= goals.SUBSET_ROWS else _among_all
+    yield from within(sampler, storage, query, table, returns, goal, todo)
+
+
+def _in_subsets(sampler, storage, query, table, returns, goal, todo) -> Iterator[Found]:
+    for number in goal[todo].unique().tolist():
+        part = todo[goal[todo] == number]
+        own, index = table.subset(number, lambda rows: sampler.subset(storage, rows))
+        rows, near = sampler.nearest(storage, query[part], among=index)
+        yield part, own[rows.clamp_min(0)], near, near >= sampler.threshold
+
+
+def _among_all(sampler, storage, query, table, returns, goal, todo) -> Iterator[Found]:
+    total = len(returns.last)
+    k = min(sampler.k, total)
     count = min(total, int(MORE * k / float(returns.share[goal[todo]].min())) + 1)
     while len(todo):
         unsettled = []
@@ -54,13 +77,11 @@ def goal_neighbours(
             rank = valid.cumsum(-1)  # of those that are neighbours; all others go to a last place
             settled |= rank[:, -1] >= k
             place = torch.where(valid & (rank <= k), rank - 1, k)[settled]
-            yield (
-                part[settled],
-                *(
-                    column.new_zeros(len(place), k + 1).scatter_(1, place, column[settled])[:, :k]
-                    for column in (rows, near, valid)
-                ),
+            rows, near, valid = (
+                column.new_zeros(len(place), k + 1).scatter_(1, place, column[settled])[:, :k]
+                for column in (rows, near, valid)
             )
+            yield part[settled], rows, near, valid
             unsettled.append(part[~settled])
         todo, count = torch.cat(unsettled), min(2 * count, total)
 
@@ -131,12 +152,13 @@ class GoalRule:
         number, returns = self.table.look_up(goals)
         target, near = torch.zeros_like(number), query.new_zeros(len(query), dtype=torch.float64)
         row, hit = torch.zeros_like(number), torch.zeros_like(number, dtype=torch.bool)
-        for part, rows, nears, valid in goal_neighbours(sampler, storage, query, returns, number):
-            asked = (returns, number[part], rows, valid)
+        asked = (query, self.table, returns, number)
+        for part, rows, nears, valid in goal_neighbours(sampler, storage, *asked):
+            found = (returns, number[part], rows, valid)
             if self.ahead is None:
-                chosen, place = goal_highest(*asked, self.horizon, self.min_offset)
+                chosen, place = goal_highest(*found, self.horizon, self.min_offset)
             else:
-                chosen, place = goal_followed(*asked, self.ahead)
+                chosen, place = goal_followed(*found, self.ahead)
             hit[part] = valid[:, 0]
             target[part], row[part] = chosen, rows.gather(-1, place)[:, 0]
             near[part] = nears.gather(-1, place)[:, 0]

@@ -11,11 +11,13 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from torchrl_rad.data.experts import select_episodes
+from torchrl_rad.retrieval.index import SearchIndex
 from torchrl_rad.retrieval.windows import WindowMax
 
 __all__ = ["GoalReward", "GoalReturns", "GoalTable"]
 
 GOALS = 1024  # for which what was found is kept
+SUBSET_ROWS = 2**22  # in search structures of their own, for all goals together
 
 
 @dataclass(frozen=True)
@@ -191,6 +193,7 @@ class GoalTable:
         self.places: Tensor | None = None  # of them the entries that a goal has
         self.goals: dict[tuple[float, ...], _Goal] = {}
         self.batch: tuple[Any, GoalReturns] | None = None
+        self.subsets: dict[tuple[float, ...], tuple[Tensor, SearchIndex]] = {}
 
     def look_up(self, goals: Tensor) -> tuple[Tensor, GoalReturns]:
         """Which goal of the returned ones each of ``goals`` [Q, G] is, int64 [Q].
@@ -205,6 +208,25 @@ class GoalTable:
         if self.batch is None or self.batch[0] != names:
             self.batch = names, self._joined([self._goal(name) for name in names])
         return number, self.batch[1]
+
+    def subset(
+        self, number: int, make: Callable[[Tensor], SearchIndex]
+    ) -> tuple[Tensor, SearchIndex]:
+        """Rows, int64, of the demonstrations for a goal of the last batch, and their structure.
+
+        Those that were not asked for the longest are given up, so that SUBSET_ROWS are not passed.
+        """
+        assert self.batch is not None
+        names, returns = self.batch
+        kept = self.subsets.pop(names[number], None)
+        if kept is None:
+            rows = returns.experts[number][self.episode].nonzero()[:, 0]
+            kept = rows, make(rows)
+            held = len(rows) + sum(len(other) for other, _ in self.subsets.values())
+            while held > SUBSET_ROWS and self.subsets:
+                held -= len(self.subsets.pop(next(iter(self.subsets)))[0])
+        self.subsets[names[number]] = kept
+        return kept
 
     def _joined(self, found: list[_Goal]) -> GoalReturns:
         count, none = len(self.last), self.last.new_zeros(0)  # also for no goal at all

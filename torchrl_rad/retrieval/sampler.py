@@ -150,13 +150,21 @@ class RetrievalSampler(Sampler):
         info = {name: value.reshape(shape).to(device) for name, value in info.items()}
         return index.reshape(shape).to(device), info
 
-    def nearest(self, storage: Any, query: Tensor, k: int | None = None) -> tuple[Tensor, Tensor]:
+    def nearest(
+        self,
+        storage: Any,
+        query: Tensor,
+        k: int | None = None,
+        among: SearchIndex | None = None,
+    ) -> tuple[Tensor, Tensor]:
         """The nearest rows of queries [Q, S], whatever the threshold.
 
         Args:
             storage (Storage): where the rows are.
             query (Tensor): [Q, S] in raw units.
             k (int, optional): number of rows. Defaults to that of the sampler.
+            among (SearchIndex, optional): of :meth:`subset`; rows are then numbers in it. Defaults
+                to all rows.
 
         Returns:
             Rows, int64 [Q, min(k, N)], and similarities, float64, on the device of the rows; -1 and
@@ -167,7 +175,8 @@ class RetrievalSampler(Sampler):
             rows = torch.full((len(query), 0), -1)
             return rows, torch.empty(len(query), 0, dtype=torch.float64)
         index, query, finite = self._ready(storage, query)
-        k = min(self.k if k is None else k, count)
+        index = index if among is None else among
+        k = min(self.k if k is None else k, len(index.rows))
         near, rows = _joined([index.search(part, k) for part in self._parts(query, k)])
         if finite is not None:
             near, rows = torch.where(finite, near, -torch.inf), torch.where(finite, rows, -1)
@@ -266,6 +275,11 @@ class RetrievalSampler(Sampler):
             self._index = grow_index(self._index, rows, self.metric, self.backend, self.k)
             self._grown = False
         return self._index
+
+    def subset(self, storage: Any, rows: Tensor) -> SearchIndex:
+        """A search structure of some rows, int64 [M], of the storage as it is now."""
+        states = self.build(storage).rows.index_select(0, rows)
+        return build_index(states, self.metric, "auto", self.k)
 
     def extended(self, storage: Any, before: tuple) -> None:
         """Rows were added behind those that there were at a revision, which are unchanged."""
