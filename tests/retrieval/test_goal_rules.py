@@ -161,19 +161,18 @@ def test_neighbours_are_of_demonstrations(monkeypatch, more, threshold):
     number, returns = table.look_up(wanted)
     query = database[:]["observation"][::100] + 0.01
     queries, goal = query.repeat(len(wanted), 1), number.repeat_interleave(len(query))
-    answers = {}
     asked = (database.sampler, database.storage, queries, table, returns, goal)
-    for part, rows, near, valid in goal_neighbours(*asked):
-        for i, number in enumerate(part.tolist()):
-            assert number not in answers
-            answers[number] = list(
-                zip(near[i][valid[i]].tolist(), rows[i][valid[i]].tolist(), strict=True)
-            )
+    rows, near, valid = goal_neighbours(*asked)
+    assert rows.shape == near.shape == valid.shape == (len(queries), 7)
+    answers = [
+        list(zip(near[i][valid[i]].tolist(), rows[i][valid[i]].tolist(), strict=True))
+        for i in range(len(queries))
+    ]
     reached = 0
     for number, state in enumerate(queries.double().tolist()):
         experts = returns.experts[goal[number]][returns.episode]
         if not experts.any():
-            assert number not in answers
+            assert answers[number] == []
             continue
         reached += 1
         index = experts.nonzero()[:, 0]

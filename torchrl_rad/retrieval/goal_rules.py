@@ -28,7 +28,7 @@ def goal_neighbours(
     table: GoalTable,
     returns: GoalReturns,
     goal: Tensor,
-) -> Iterator[Found]:
+) -> tuple[Tensor, Tensor, Tensor]:
     """The neighbours of queries among the rows of demonstrations for their goals.
 
     Each goal gets a search structure of those rows, as long as they are SUBSET_ROWS at most for all
@@ -41,17 +41,22 @@ def goal_neighbours(
         table, returns: the table, and what it gave for the goals.
         goal (Tensor): int64 [Q], which of them each query has.
 
-    Yields:
-        For n of the queries, in the end for each whose goal somebody reaches: which, int64 [n];
-        rows, int64 [n, k], most similar first; their similarities, float64; and which of them are
-        neighbours, bool.
+    Returns:
+        Rows, int64 [Q, k], most similar first; their similarities, float64; and which of them are
+        neighbours, bool: none where nobody reaches the goal.
     """
+    k = min(sampler.k, len(returns.last))
+    rows = goal.new_zeros(len(query), k)
+    near, valid = torch.zeros_like(rows, dtype=torch.float64), torch.zeros_like(rows).bool()
     todo = (returns.share[goal] > 0).nonzero()[:, 0]
-    if len(todo) == 0:
-        return
-    share = float(returns.share[goal[todo].unique()].sum())
-    within = _in_subsets if share * len(returns.last) <= goals.SUBSET_ROWS else _among_all
-    yield from within(sampler, storage, query, table, returns, goal, todo)
+    if len(todo):
+        share = float(returns.share[goal[todo].unique()].sum())
+        search_all = share * len(returns.last) > goals.SUBSET_ROWS
+        search_in = _among_all if search_all else _in_subsets
+        for part, *found in search_in(sampler, storage, query, table, returns, goal, todo):
+            for column, value in zip((rows, near, valid), found, strict=True):
+                column[part, : value.shape[1]] = value
+    return rows, near, valid
 
 
 def _in_subsets(sampler, storage, query, table, returns, goal, todo) -> Iterator[Found]:
@@ -150,22 +155,19 @@ class GoalRule:
         """As :meth:`~torchrl_rad.retrieval.rules.TargetRule.choose`."""
         assert goals is not None
         number, returns = self.table.look_up(goals)
-        target, near = torch.zeros_like(number), query.new_zeros(len(query), dtype=torch.float64)
-        row, hit = torch.zeros_like(number), torch.zeros_like(number, dtype=torch.bool)
         asked = (query, self.table, returns, number)
-        for part, rows, nears, valid in goal_neighbours(sampler, storage, *asked):
-            found = (returns, number[part], rows, valid)
-            if self.ahead is None:
-                chosen, place = goal_highest(*found, self.horizon, self.min_offset)
-            else:
-                chosen, place = goal_followed(*found, self.ahead)
-            hit[part] = valid[:, 0]
-            target[part], row[part] = chosen, rows.gather(-1, place)[:, 0]
-            near[part] = nears.gather(-1, place)[:, 0]
+        rows, nears, valid = goal_neighbours(sampler, storage, *asked)
+        if self.ahead is None:
+            limits = (self.horizon, self.min_offset)
+            target, place = goal_highest(returns, number, rows, valid, *limits)
+        else:
+            target, place = goal_followed(returns, number, rows, valid, self.ahead)
+        hit = valid.any(-1)
+        row, near = rows.gather(-1, place)[:, 0], nears.gather(-1, place)[:, 0]
         none = ~hit
         if none.any():
-            rows, nears = sampler.nearest(storage, query[none], 1)
-            row[none], near[none] = rows[:, 0], nears[:, 0]
+            some, most = sampler.nearest(storage, query[none], 1)
+            row[none], near[none] = some[:, 0], most[:, 0]
         return Choice(target, row, near, hit)
 
     def value(self, rows: Tensor, goals: Tensor | None) -> Tensor:
