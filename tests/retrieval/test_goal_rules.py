@@ -13,11 +13,11 @@ from torchrl_rad.retrieval.goals import GoalTable
 from ..oracle import for_goal, neighbours, ranking, target_of
 
 
-@pytest.fixture(scope="module", autouse=True, params=[0, goals.SUBSET_ROWS], ids=["all", "own"])
+@pytest.fixture(scope="module", autouse=True, params=[0, goals.SUBSET_ENTRIES], ids=["all", "own"])
 def searched(request):
     """All rows are searched, or for each goal those of its demonstrations."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(goals, "SUBSET_ROWS", request.param)
+        patch.setattr(goals, "SUBSET_ENTRIES", request.param)
         yield request.param > 0
 
 
@@ -207,21 +207,20 @@ def test_the_goal_of_another_row_does_not_show():
     assert out["target_return"][1] == 0.0 and 0 < out["similarity"][1] <= 1
 
 
-def test_few_rows_are_held_for_goals(monkeypatch):
+def test_few_rows_are_held_for_goals():
     database, following = walk()
     table = GoalTable(database[:], "observation", 0.9, GoalReward(0.5))
     _, returns = table.look_up(following[::60])
     sizes = (returns.share * len(following)).round().long().tolist()
-    monkeypatch.setattr(goals, "SUBSET_ROWS", sizes[0] + sizes[1])
-    made = []
+    made, most = [], sizes[0] + sizes[1]
 
     def make(rows):
         made.append(len(rows))
         return database.sampler.subset(database.storage, rows)
 
     for i in (0, 1, 0, 1):
-        table.subset(i, make)
+        table.subset(i, make, most)
     assert made == sizes[:2]
-    table.subset(2, make)
+    table.subset(2, make, most)
     assert made == sizes[:3]
-    assert sum(len(rows) for rows, _ in table.subsets.values()) <= sum(sizes[:2])
+    assert sum(len(rows) for rows, _ in table.subsets.values()) <= most

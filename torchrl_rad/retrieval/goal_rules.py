@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import partial
 from typing import Any
 
 import torch
@@ -31,8 +32,8 @@ def goal_neighbours(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """The neighbours of queries among the rows of demonstrations for their goals.
 
-    Each goal gets a search structure of those rows, as long as they are SUBSET_ROWS at most for all
-    goals together. Beyond, as many of the nearest of all rows are looked at as hold k of them.
+    Each goal gets a search structure of those rows, as long as all of them together are not larger
+    than SUBSET_ENTRIES. Beyond, as many of the nearest of all rows are looked at as hold k of them.
 
     Args:
         sampler (RetrievalSampler): finds the rows.
@@ -51,18 +52,24 @@ def goal_neighbours(
     todo = (returns.share[goal] > 0).nonzero()[:, 0]
     if len(todo):
         share = float(returns.share[goal[todo].unique()].sum())
-        search_all = share * len(returns.last) > goals.SUBSET_ROWS
-        search_in = _among_all if search_all else _in_subsets
+        fits = share * len(returns.last) <= _most(sampler, storage)
+        search_in = _in_subsets if fits else _among_all
         for part, *found in search_in(sampler, storage, query, table, returns, goal, todo):
             for column, value in zip((rows, near, valid), found, strict=True):
                 column[part, : value.shape[1]] = value
     return rows, near, valid
 
 
+def _most(sampler: RetrievalSampler, storage: Any) -> int:
+    """Rows in the structures of all goals."""
+    return goals.SUBSET_ENTRIES // sampler.build(storage).rows.shape[-1]
+
+
 def _in_subsets(sampler, storage, query, table, returns, goal, todo) -> Iterator[Found]:
+    most = _most(sampler, storage)
     for number in goal[todo].unique().tolist():
         part = todo[goal[todo] == number]
-        own, index = table.subset(number, lambda rows: sampler.subset(storage, rows))
+        own, index = table.subset(number, partial(sampler.subset, storage), most)
         rows, near = sampler.nearest(storage, query[part], among=index)
         yield part, own[rows.clamp_min(0)], near, near >= sampler.threshold
 
@@ -70,25 +77,29 @@ def _in_subsets(sampler, storage, query, table, returns, goal, todo) -> Iterator
 def _among_all(sampler, storage, query, table, returns, goal, todo) -> Iterator[Found]:
     total = len(returns.last)
     k = min(sampler.k, total)
-    count = min(total, int(MORE * k / float(returns.share[goal[todo]].min())) + 1)
+    # powers of two, so that many queries look at as many rows
+    count = (MORE * k / returns.share[goal[todo]]).log2().ceil().exp2().long().clamp(1, total)
     while len(todo):
-        unsettled = []
-        for part in todo.split(max(1, search.SCAN_ENTRIES // count)):
-            rows, near = sampler.nearest(storage, query[part], count)
-            rows = rows.clamp_min(0)  # of a query with NaN
-            valid = near >= sampler.threshold
-            settled = ~valid[:, -1] | (count == total)
-            valid &= returns.experts[goal[part][:, None], returns.episode[rows]]
-            rank = valid.cumsum(-1)  # of those that are neighbours; all others go to a last place
-            settled |= rank[:, -1] >= k
-            place = torch.where(valid & (rank <= k), rank - 1, k)[settled]
-            rows, near, valid = (
-                column.new_zeros(len(place), k + 1).scatter_(1, place, column[settled])[:, :k]
-                for column in (rows, near, valid)
-            )
-            yield part[settled], rows, near, valid
-            unsettled.append(part[~settled])
-        todo, count = torch.cat(unsettled), min(2 * count, total)
+        most = int(count.min())
+        now = (count == most).nonzero()[:, 0][: max(1, search.SCAN_ENTRIES // most)]
+        part = todo[now]
+        rows, near = sampler.nearest(storage, query[part], most)
+        rows = rows.clamp_min(0)  # of a query with NaN
+        valid = near >= sampler.threshold
+        settled = ~valid[:, -1] | (most == total)
+        valid &= returns.experts[goal[part][:, None], returns.episode[rows]]
+        rank = valid.cumsum(-1)  # of those that are neighbours; all others go to a last place
+        settled |= rank[:, -1] >= k
+        place = torch.where(valid & (rank <= k), rank - 1, k)[settled]
+        rows, near, valid = (
+            column.new_zeros(len(place), k + 1).scatter_(1, place, column[settled])[:, :k]
+            for column in (rows, near, valid)
+        )
+        yield part[settled], rows, near, valid
+        count[now] = min(2 * most, total)
+        left = torch.ones_like(todo, dtype=torch.bool)
+        left[now[settled]] = False
+        todo, count = todo[left], count[left]
 
 
 def goal_followed(

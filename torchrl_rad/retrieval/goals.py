@@ -17,7 +17,7 @@ from torchrl_rad.retrieval.windows import WindowMax
 __all__ = ["GoalReward", "GoalReturns", "GoalTable"]
 
 GOALS = 1024  # for which what was found is kept
-SUBSET_ROWS = 2**22  # in search structures of their own, for all goals together
+SUBSET_ENTRIES = 2**24  # of states in search structures of their own, for all goals together
 
 
 @dataclass(frozen=True)
@@ -210,11 +210,11 @@ class GoalTable:
         return number, self.batch[1]
 
     def subset(
-        self, number: int, make: Callable[[Tensor], SearchIndex]
+        self, number: int, make: Callable[[Tensor], SearchIndex], most: int
     ) -> tuple[Tensor, SearchIndex]:
         """Rows, int64, of the demonstrations for a goal of the last batch, and their structure.
 
-        Those that were not asked for the longest are given up, so that SUBSET_ROWS are not passed.
+        Those that were not asked for the longest are given up, so that all have ``most`` rows.
         """
         assert self.batch is not None
         names, returns = self.batch
@@ -223,7 +223,7 @@ class GoalTable:
             rows = returns.experts[number][self.episode].nonzero()[:, 0]
             kept = rows, make(rows)
             held = len(rows) + sum(len(other) for other, _ in self.subsets.values())
-            while held > SUBSET_ROWS and self.subsets:
+            while held > most and self.subsets:
                 held -= len(self.subsets.pop(next(iter(self.subsets)))[0])
         self.subsets[names[number]] = kept
         return kept
