@@ -55,7 +55,9 @@ def parse() -> argparse.Namespace:
 def recorded_steps(folder: Path, like: ExpertDatabase) -> ExpertDatabase:
     """All episodes that the policy's run recorded, searched as its own database is."""
     _, data = make_data(RunFolder.open(folder.absolute().parents[1]).config())
-    return make_database(data, {"gamma": like.gamma, "sampler": like.sampler.config})
+    # of more rows as many more, which lie in the same area: they have to reach across the goal
+    k = round(like.sampler.k * len(data) / len(like))
+    return make_database(data, {"gamma": like.gamma, "sampler": {**like.sampler.config, "k": k}})
 
 
 def load(arguments: argparse.Namespace) -> TensorDictSequential:

@@ -9,7 +9,7 @@ from tensordict import TensorDict
 from torchrl.data import LazyTensorStorage
 
 from torchrl_rad import ExpertDatabase, RetrievalSampler, RetrievalTargetModule
-from torchrl_rad.provenance import demonstration_usage, provenance, write_provenance
+from torchrl_rad.provenance import demonstration_usage, provenance_table, write_provenance
 
 NAMES = ["target", "found", "similarity", "target_return", "target_index", "target_offset"]
 NAMES += ["target_source"]
@@ -63,7 +63,7 @@ def test_source_by_hand():
 
 def test_provenance_by_hand():
     steps, _ = driven()
-    columns = provenance(steps)
+    columns = provenance_table(steps)
     assert columns["row"].tolist() == [0, 0, 0, 0, 1, 1]  # up to its end
     assert columns["step"].tolist() == [0, 1, 2, 3, 0, 1]
     assert columns["found"].tolist() == [True, True, True, False, True, True]
@@ -80,7 +80,7 @@ def test_written_as_read(tmp_path):
     write_provenance(tmp_path / "followed.csv", steps)
     with open(tmp_path / "followed.csv", newline="") as file:
         rows = list(csv.DictReader(file))
-    columns = provenance(steps)
+    columns = provenance_table(steps)
     assert len(rows) == 6 and list(rows[0]) == list(columns)
     for name, column in columns.items():
         assert [float(row[name]) for row in rows] == column.astype(float).tolist()
@@ -107,4 +107,4 @@ def test_nothing_was_followed():
 
 def test_steps_without_sources():
     with pytest.raises(KeyError, match="no 'target_source': ask RetrievalTargetModule"):
-        provenance(driven()[0].exclude("target_source"))
+        provenance_table(driven()[0].exclude("target_source"))

@@ -4,6 +4,15 @@ from pathlib import Path
 import pytest
 import torch
 
+from torchrl_rad import (
+    ExpertDatabase,
+    RetrievalSampler,
+    build_policy,
+    pointmaze_dataset,
+    save_policy,
+)
+from torchrl_rad.policy import fit_scales
+
 ROOT = Path(__file__).parents[1]
 IMPORTS = """
 import torch
@@ -35,6 +44,26 @@ def test_targets_for_your_own_policy(tmp_path, monkeypatch):
     assert torch.equal(batch["target"][hit], rows[index[hit]])
     assert torch.equal(batch["target"][~hit], batch["observation"][~hit])
     names["collector"].shutdown()
+
+
+@pytest.mark.filterwarnings("ignore::UserWarning")
+def test_any_goal(tmp_path, monkeypatch):
+    monkeypatch.setenv("TORCHRL_RAD_CACHE", str(tmp_path))
+    planner = {"width": 16, "heads": 2, "blocks": 1, "steps": 1}
+    about = {"state_dim": 4, "action_dim": 2, "planner": planner, "estimator": {"width": 8}}
+    about["target"] = {"rule": "followed", "ahead": 16, "horizon": 33}
+    database = ExpertDatabase(sampler=RetrievalSampler("euclidean", dims=[0, 1]))
+    database.extend(pointmaze_dataset("umaze", steps=3000, progress=False))
+    policy = build_policy(about, database)
+    fit_scales(policy, database[:])
+    save_policy(tmp_path / "policies" / "followed", policy, about, database)
+    (block,) = [block for block in blocks("python") if "with_goals(" in block]
+    assert len(block.strip().splitlines()) <= 10
+    names: dict = {}
+    exec(IMPORTS + block.replace("<run folder>", str(tmp_path)), names)
+    assert names["arrived"].shape == (3,) and names["steps"].shape == (3, 300)
+    assert names["steps"]["found"][:, 0].all()
+    names["env"].close()
 
 
 def test_two_commands_set_up_everything():

@@ -13,6 +13,7 @@ from torchrl_rad.objectives import *  # noqa: F403
 from torchrl_rad.objectives import __all__ as _objectives
 from torchrl_rad.policy import build_policy, load_policy, save_policy, with_goals
 from torchrl_rad.precision import planning_dtype
+from torchrl_rad.provenance import demonstration_usage, provenance_table, write_provenance
 from torchrl_rad.retrieval import *  # noqa: F403
 from torchrl_rad.retrieval import __all__ as _retrieval
 from torchrl_rad.training import Objective, train
@@ -22,12 +23,15 @@ __all__ = [
     "Checkpointer",
     "Objective",
     "build_policy",
+    "demonstration_usage",
     "evaluate",
     "load_policy",
     "planning_dtype",
+    "provenance_table",
     "save_policy",
     "similarity_threshold",
     "train",
     "with_goals",
+    "write_provenance",
 ]
 __all__ += [*_data, *_envs, *_modules, *_objectives, *_retrieval]

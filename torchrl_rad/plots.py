@@ -14,7 +14,7 @@ from tensordict.nn import TensorDictSequential
 from torchrl_rad.data.database import ExpertDatabase
 from torchrl_rad.envs.maze import GOAL_RADIUS, FixedGoalMaze, MazeTask
 from torchrl_rad.evaluation import interval
-from torchrl_rad.provenance import provenance
+from torchrl_rad.provenance import provenance_table
 
 __all__ = ["plot_curves", "plot_followed", "plot_growth", "plot_targets"]
 
@@ -163,7 +163,7 @@ def plot_followed(
     """
     pyplot = _pyplot()
     env = FixedGoalMaze(task, goal_cell)
-    columns = provenance(steps[row : row + 1])
+    columns = provenance_table(steps[row : row + 1])
     used = np.unique(columns["episode"][columns["found"]])
     rows, width = len(env.maze.maze_map), len(env.maze.maze_map[0])
     figure, axis = pyplot.subplots(figsize=(5.0, 5.0 * rows / width + 0.7))

@@ -13,10 +13,10 @@ from tensordict import TensorDictBase
 from torchrl_rad._files import write_atomic
 from torchrl_rad.evaluation import episode_results
 
-__all__ = ["demonstration_usage", "provenance", "write_provenance"]
+__all__ = ["demonstration_usage", "provenance_table", "write_provenance"]
 
 
-def provenance(steps: TensorDictBase) -> dict[str, np.ndarray]:
+def provenance_table(steps: TensorDictBase) -> dict[str, np.ndarray]:
     """What was followed at each step, as columns.
 
     Args:
@@ -62,8 +62,8 @@ def provenance(steps: TensorDictBase) -> dict[str, np.ndarray]:
 
 
 def write_provenance(path: str | Path, steps: TensorDictBase) -> None:
-    """Writes :func:`provenance` as a csv file, whole or not at all."""
-    columns = provenance(steps)
+    """Writes :func:`provenance_table` as a csv file, whole or not at all."""
+    columns = provenance_table(steps)
     columns["found"] = columns["found"].astype(int)
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
@@ -80,7 +80,7 @@ def demonstration_usage(steps: TensorDictBase) -> list[dict[str, Any]]:
         which it was followed; ``episodes`` that followed it; and of these the mean ``return`` and
         the share that had ``success``.
     """
-    columns, results = provenance(steps), episode_results(steps)
+    columns, results = provenance_table(steps), episode_results(steps)
     found = columns["found"]
     ids, place = np.unique(columns["episode"][found], return_inverse=True)
     used = np.zeros((len(ids), len(steps)), dtype=np.int64)
