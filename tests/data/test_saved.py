@@ -147,7 +147,7 @@ def test_failure_keeps_the_old_one(folder, monkeypatch):
     def fail(*args):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("torchrl_rad.data.database.write_json", fail)
+    monkeypatch.setattr("torchrl_rad.data.saving.write_json", fail)
     with pytest.raises(OSError, match="No space left"):
         database.dumps(folder)
     assert ExpertDatabase.loads(folder).digest() == digest
