@@ -17,6 +17,7 @@ MEMORY = ("index_bytes", "rule_bytes", "payload_bytes")
 HEADINGS = {"batch": "environments", "p50_ms": "ms", "p95_ms": "p95", "plain_ms": "plain"}
 HEADINGS |= {name: name.replace("_bytes", " MB") for name in MEMORY}
 HEADINGS |= {"plain_scan_ms": "plain scan", "windows": "batch"}
+HEADINGS |= {"recorded_ms": "recorded", "added_ms": "added"}
 SCALES = {"10000": "10k", "100000": "100k", "1000000": "1M"}
 PARTS = ("TS", "SE", "PL", "ID", "total")
 COLOURS = ("#4c72b0", "#dd8452", "#55a868", "#c44e52")  # as torchrl_rad's other pictures
@@ -125,7 +126,11 @@ def searches(entries: Entries) -> list[str | None]:
                 tables.append(pivot(title, part, ("rows", "dims"), "k", figures))
     replans = chosen(entries, "replan")
     title = "Target rule along recorded episodes of PointMaze, by position"
-    return [*tables, pivot(title, replans, ("rule", "queries", "rows"), "k", figures)]
+    tables.append(pivot(title, replans, ("rule", "queries", "rows"), "k", figures))
+    figures = ("p50_ms", "p95_ms", "recorded_ms", "added_ms")
+    title = "Goals that rows bring along, beside recorded returns"
+    keys = ("queries", "goals")
+    return [*tables, pivot(title, chosen(entries, "goal"), keys, "rule", figures)]
 
 
 def plans(entries: Entries) -> list[str | None]:

@@ -221,17 +221,46 @@ def replanned():
     return filled(steps[:held], dims=[0, 1]), others
 
 
+def along(others: torch.Tensor, queries: int) -> torch.Tensor:
+    """Consecutive states [DRIVEN, queries, S] of the episodes; later ones if there are too few."""
+    number = torch.arange(queries)
+    begin = number // len(others) * 40
+    return others[number % len(others), begin + torch.arange(DRIVEN)[:, None]]
+
+
 @sizes
 @rules
 def test_rad_replan_speed(benchmark, replanned, k, queries, rule):
     """Along episodes that MuJoCo recorded and the database does not hold, searched by position."""
     database, others = replanned
-    number = torch.arange(queries)
-    begin = number // len(others) * 40  # more queries than episodes: others start later
-    index = begin + torch.arange(DRIVEN)[:, None]
-    states = others[number % len(others), index]
     benchmark.extra_info["rows"] = len(database)
-    measure_target(benchmark, database, states, k, rule)
+    measure_target(benchmark, database, along(others, queries), k, rule)
+
+
+@pytest.mark.parametrize(
+    "queries, goals", [(1, 1), (50, 1), (50, 50)], ids=["q1-g1", "q50-g1", "q50-g50"]
+)
+@rules
+def test_rad_goal_speed(benchmark, replanned, queries, goals, rule):
+    """Goals that rows bring along, beside the recorded returns, which need no look-up."""
+    database, others = replanned
+    database.sampler.k = 500
+    places = others[:, ::10, :2].flatten(0, 1)  # recorded, so that somebody gets there
+    goal = places[:: len(places) // goals][:goals].expand(queries, 2)
+    settings = {"horizon": 129, "rule": rule, "ahead": 16}
+    select = RetrievalTargetModule(database, goal_key="goal", **settings)
+    plain = RetrievalTargetModule(database, **settings)
+    endless = cycle(along(others, queries))
+
+    def asked(module):
+        return module(TensorDict({"observation": next(endless), "goal": goal}, [queries]))
+
+    times = [spent(lambda: asked(plain)) for _ in range(21)][1:]
+    found = run(benchmark, lambda: asked(select))["found"].float().mean()
+    times += [spent(lambda: asked(plain)) for _ in range(20)]
+    recorded_ms = float(np.median(times))
+    added_ms = benchmark.extra_info["p50_ms"] - recorded_ms
+    benchmark.extra_info.update(recorded_ms=recorded_ms, added_ms=added_ms, found=float(found))
 
 
 if __name__ == "__main__":
