@@ -11,13 +11,16 @@ import logging
 import sys
 from pathlib import Path
 
+import numpy as np
 import torch
 from tensordict.nn import TensorDictSequential
 from torchrl._utils import logger as torchrl_logger
 
 from torchrl_rad import ExpertDatabase, make_maze_env, maze_task, with_goals
 from torchrl_rad.checkpoint import CheckpointError, read_json
+from torchrl_rad.evaluation import episode_results
 from torchrl_rad.experiment import collect_episodes, make_data, make_database, policy_row
+from torchrl_rad.plots import plot_followed
 from torchrl_rad.policy import load_policy
 from torchrl_rad.precision import planning_dtype
 from torchrl_rad.provenance import write_provenance
@@ -49,6 +52,7 @@ def parse() -> argparse.Namespace:
         "recorded are searched by default"
     )  # fmt: skip
     parser.add_argument("--csv", help="file for what was followed at each step")
+    parser.add_argument("--picture", help="png of the longest way to the first goal")
     return parser.parse_args()
 
 
@@ -96,6 +100,10 @@ def main() -> None:
         print("these are of the task's own goal; plans were not ranked: the return model is of it")
     if arguments.csv:
         write_provenance(arguments.csv, steps)
+    if arguments.picture:
+        way = episode_results(steps[:count])["arrival"]
+        longest = int(np.nan_to_num(way).argmax())
+        plot_followed(task, steps, policy[0].database, longest, arguments.picture, goals[0])
 
 
 if __name__ == "__main__":

@@ -13,7 +13,7 @@ from tensordict.nn import TensorDictSequential
 
 from torchrl_rad.data.database import ExpertDatabase
 from torchrl_rad.envs.maze import GOAL_RADIUS, FixedGoalMaze, MazeTask
-from torchrl_rad.evaluation import interval
+from torchrl_rad.evaluation import episode_results, interval
 from torchrl_rad.provenance import provenance_table
 
 __all__ = ["plot_curves", "plot_followed", "plot_growth", "plot_targets"]
@@ -146,6 +146,7 @@ def plot_followed(
     row: int,
     path: str | Path,
     goal_cell: tuple[int, int] | None = None,
+    after: int = 60,
 ) -> None:
     """Draws one episode's path over the demonstrations that it followed.
 
@@ -156,6 +157,7 @@ def plot_followed(
         row (int): which of the n episodes.
         path (path): a png.
         goal_cell (tuple of int, optional): another goal than the task's.
+        after (int, optional): steps drawn after the first reward. Defaults to ``60``.
 
     Raises:
         ImportError: matplotlib is not installed.
@@ -163,7 +165,9 @@ def plot_followed(
     """
     pyplot = _pyplot()
     env = FixedGoalMaze(task, goal_cell)
-    columns = provenance_table(steps[row : row + 1])
+    arrival = episode_results(steps[row : row + 1])["arrival"][0]
+    last = steps.shape[1] if np.isnan(arrival) else int(arrival) + after
+    columns = provenance_table(steps[row : row + 1, :last])
     used = np.unique(columns["episode"][columns["found"]])
     rows, width = len(env.maze.maze_map), len(env.maze.maze_map[0])
     figure, axis = pyplot.subplots(figsize=(5.0, 5.0 * rows / width + 0.7))

@@ -124,7 +124,19 @@ def test_no_folder():
 def test_goals_without_training(whole, tmp_path):
     policy = whole[0].path / "policies" / "followed"
     csv = tmp_path / "followed.csv"
-    lines = score(policy, "--episodes", "2", "--goals", "3,1", "1,3", "--csv", str(csv))
+    lines = score(
+        policy,
+        "--episodes",
+        "2",
+        "--goals",
+        "3,1",
+        "1,3",
+        "--csv",
+        str(csv),
+        "--picture",
+        str(csv.with_suffix(".png")),
+    )
+    assert csv.with_suffix(".png").stat().st_size > 10_000
     rows = [[cell.strip() for cell in line.split("|")][1] for line in lines[2:4]]
     assert rows == ["umaze (3, 1)", "umaze (1, 3)"]
     assert "the return model is of it" in lines[-1]
