@@ -13,7 +13,13 @@ from torchrl.data import Composite, LazyMemmapStorage, LazyTensorStorage, Unboun
 from torchrl.envs import Compose, EnvBase, InitTracker, SerialEnv, TransformedEnv
 from torchrl.testing.mocking_classes import ContinuousActionVecMockEnv
 
-from torchrl_rad import ExpertDatabase, GoalReward, RetrievalSampler, RetrievalTargetModule
+from torchrl_rad import (
+    ExpertDatabase,
+    GoalReward,
+    RetrievalSampler,
+    RetrievalTargetModule,
+    first_hit_within,
+)
 from torchrl_rad.modules import target
 
 from ..oracle import target_of
@@ -438,6 +444,25 @@ def test_goals_of_another_width_or_missing():
         module(database(), goal_key="goal", tolerance=0.5)
     with pytest.raises(ValueError, match="goal_reward is given without a goal_key"):
         module(database(), goal_reward=GoalReward())
+
+
+def test_the_expert_rule_follows_the_goal():
+    # three episodes along one line, whose states pass 3 after 3, 1 and 6 steps
+    states = torch.cat([torch.arange(0.0, 9.0), torch.arange(2.0, 11.0), torch.arange(-3.0, 6.0)])
+    steps = episodes(states[:, None], [9, 9, 9], (states[:, None] > 1e9).float())
+    made = database(capacity=99, k=3, threshold=0.0, gamma=0.5)
+    made.extend(steps)
+    made.expert = first_hit_within(2, 4)
+    goals, reward = [[3.0]], GoalReward(radius=0.1)
+    out = ask_goals(module(made, goal_key="goal", goal_reward=reward), [[1.0]], goals)
+    assert out["found"] and out["target_index"] < 9
+    # only the third one is an expert's by another rule
+    reward = GoalReward(radius=0.1, expert=first_hit_within(5, 9))
+    out = ask_goals(module(made, goal_key="goal", goal_reward=reward), [[1.0]], goals)
+    assert out["target_index"] >= 18
+    made.expert = lambda episode: bool((episode["observation"] > 9).any())  # sees all of a step
+    out = ask_goals(module(made, goal_key="goal", goal_reward=GoalReward(0.1)), [[1.0]], goals)
+    assert 9 <= out["target_index"] < 18
 
 
 def test_goals_see_a_database_change():

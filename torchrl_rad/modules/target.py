@@ -277,14 +277,15 @@ class RetrievalTargetModule(TensorDictModuleBase):
             values, remaining = rows["return_to_go"], rows["remaining"]
             key, gamma = self.database.sampler.key, self.database.gamma
             if self.goal_key is not None:
-                table = GoalTable(rows, key, gamma, self.goal_reward, self.horizon)
+                limits = (self.database.expert, self.horizon)
+                table = GoalTable(rows, key, gamma, self.goal_reward, *limits)
                 ahead = self.ahead if self.rule == "followed" else None
                 rule: TargetRule = GoalRule(table, self.horizon, self.min_offset, ahead)
             elif self.rule == "followed":
                 rule = followed_rule(values, remaining, self.ahead)
             else:
-                limits = (self.horizon, self.min_offset, self.tolerance)
-                rule = highest_rule(values, remaining, *limits)
+                settings = (self.horizon, self.min_offset, self.tolerance)
+                rule = highest_rule(values, remaining, *settings)
             self._columns = columns = _Columns(source, version, rows[key], rule)
         return columns
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 from torch import Tensor
 
 from torchrl_rad.data.experts import select_episodes
@@ -32,7 +32,8 @@ class GoalReward:
             that is over then: returns are ``gamma ** steps`` to it, and no target lies beyond.
             Defaults to ``False``.
         expert (callable, optional): one episode with that reward -> bool, whether it is a
-            demonstration for the goal; those that reach it are asked, and are all ones by default.
+            demonstration for the goal; those that reach it are asked. Defaults to the rule of the
+            database, and to all of them where it has none.
 
     Raises:
         ValueError: ``radius`` is negative.
@@ -157,10 +158,12 @@ class GoalTable:
         key (NestedKey): the state in it.
         gamma (float): discount of the returns.
         reward (GoalReward): when a goal is reached.
+        expert (callable, optional): as of :class:`GoalReward`, which may name another.
         longest (int, optional): rows of the longest window in which the best is asked for.
             Defaults to any.
 
     Examples:
+        >>> from tensordict import TensorDict
         >>> state = torch.tensor([[0.0], [1.0], [2.0], [3.0]])
         >>> rows = TensorDict({
         ...     "observation": state, "next": {"observation": state + 1},
@@ -180,10 +183,12 @@ class GoalTable:
         key: Any,
         gamma: float,
         reward: GoalReward,
+        expert: Callable[[TensorDictBase], bool] | None = None,
         longest: int | None = None,
     ):
         step, remaining = rows["step"], rows["remaining"]
-        self.gamma, self.reward, self.longest = gamma, reward, longest
+        self.rows, self.gamma, self.reward, self.longest = rows, gamma, reward, longest
+        self.expert = expert if reward.expert is None else reward.expert
         self.row = torch.arange(len(step), device=step.device)
         self.last = self.row + remaining
         starts = self.row[step == 0]
@@ -267,11 +272,11 @@ class GoalTable:
     def _experts(self, near: Tensor, hits: Tensor) -> Tensor:
         reaches = torch.zeros(len(self.lengths), dtype=torch.bool, device=hits.device)
         reaches[self.episode[hits]] = True
-        if self.reward.expert is None or not reaches.any():
+        if self.expert is None or repr(self.expert) == "reaches_goal()" or not reaches.any():
             return reaches
-        steps = TensorDict({"next": {"reward": near.float()[:, None]}}, [len(near)])
+        steps = self.rows.copy().set(("next", "reward"), near.float()[:, None])
         episodes = steps[reaches[self.episode]].split(self.lengths[reaches].tolist())
-        chosen = select_episodes(self.reward.expert, episodes)
+        chosen = select_episodes(self.expert, episodes)
         return reaches.masked_scatter(reaches, chosen.to(reaches.device))
 
 
