@@ -29,6 +29,8 @@ from torchrl_rad.runs import RunFolder
 
 torchrl_logger.setLevel(logging.WARNING)
 
+THRESHOLD = 0.7  # for goals: with 0.8 a policy that overshoots a goal may not find back
+
 
 def cell(text: str) -> tuple[int, int]:
     """``"3,1"`` -> (3, 1)."""
@@ -61,7 +63,8 @@ def recorded_steps(folder: Path, like: ExpertDatabase) -> ExpertDatabase:
     _, data = make_data(RunFolder.open(folder.absolute().parents[1]).config())
     # of more rows as many more, which lie in the same area: they have to reach across the goal
     k = round(like.sampler.k * len(data) / len(like))
-    return make_database(data, {"gamma": like.gamma, "sampler": {**like.sampler.config, "k": k}})
+    sampler = {**like.sampler.config, "k": k, "threshold": THRESHOLD}
+    return make_database(data, {"gamma": like.gamma, "sampler": sampler})
 
 
 def load(arguments: argparse.Namespace) -> TensorDictSequential:
