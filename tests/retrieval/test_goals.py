@@ -1,9 +1,12 @@
+from functools import partial
+
 import pytest
 import torch
 from tensordict import TensorDict
 
 from torchrl_rad import GoalReward, first_hit_within
 from torchrl_rad.data.episodes import return_to_go, step_and_remaining
+from torchrl_rad.data.experts import select_episodes
 from torchrl_rad.envs import relabel_goal
 from torchrl_rad.retrieval import goals as module
 from torchrl_rad.retrieval.goals import GoalTable
@@ -78,7 +81,7 @@ def test_a_goal_that_nobody_reaches(bad):
 def test_expert_rules_follow_the_goal():
     steps, lengths = rows()
     rule = first_hit_within(1, 10)
-    table = GoalTable(steps, "observation", 0.9, GoalReward(expert=rule))
+    table = GoalTable(steps, "observation", 0.9, GoalReward(), partial(select_episodes, rule))
     goals = steps["next", "observation"][::5]
     number, returns = table.look_up(goals)
     seen = set()

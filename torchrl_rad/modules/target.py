@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any, Literal, NamedTuple
 
 import torch
@@ -14,6 +15,7 @@ from torchrl.data.tensor_specs import Unbounded
 from torchrl.envs.transforms import TensorDictPrimer
 
 from torchrl_rad.data.database import ExpertDatabase
+from torchrl_rad.data.experts import select_episodes
 from torchrl_rad.retrieval.goal_rules import GoalRule
 from torchrl_rad.retrieval.goals import GoalReward, GoalTable
 from torchrl_rad.retrieval.rules import TargetRule, followed_rule, highest_rule
@@ -268,6 +270,12 @@ class RetrievalTargetModule(TensorDictModuleBase):
         offset = torch.where(found.hit, found.target - found.row, 0)
         return index.to(device), found.similarity.float().to(device), offset.to(device)
 
+    def _experts(self) -> Callable[[Sequence[TensorDictBase]], Tensor] | None:
+        """Which of the episodes that reach a goal are demonstrations; None for all."""
+        rule = self.goal_reward.expert or self.database.expert
+        asks = rule is not None and repr(rule) != "reaches_goal()"
+        return partial(select_episodes, rule) if asks else None
+
     def _prepare(self) -> _Columns:
         """The columns of the database as it is; made anew when its search structure was."""
         source = self.database.sampler.build(self.database.storage)
@@ -277,7 +285,7 @@ class RetrievalTargetModule(TensorDictModuleBase):
             values, remaining = rows["return_to_go"], rows["remaining"]
             key, gamma = self.database.sampler.key, self.database.gamma
             if self.goal_key is not None:
-                limits = (self.database.expert, self.horizon)
+                limits = (self._experts(), self.horizon)
                 table = GoalTable(rows, key, gamma, self.goal_reward, *limits)
                 ahead = self.ahead if self.rule == "followed" else None
                 rule: TargetRule = GoalRule(table, self.horizon, self.min_offset, ahead)

@@ -10,7 +10,6 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from torchrl_rad.data.experts import select_episodes
 from torchrl_rad.retrieval.index import SearchIndex
 from torchrl_rad.retrieval.windows import WindowMax
 
@@ -158,7 +157,8 @@ class GoalTable:
         key (NestedKey): the state in it.
         gamma (float): discount of the returns.
         reward (GoalReward): when a goal is reached.
-        expert (callable, optional): as of :class:`GoalReward`, which may name another.
+        experts (callable, optional): episodes that reach a goal, with its reward -> bool [E], which
+            of them are demonstrations. Defaults to all.
         longest (int, optional): rows of the longest window in which the best is asked for.
             Defaults to any.
 
@@ -183,12 +183,12 @@ class GoalTable:
         key: Any,
         gamma: float,
         reward: GoalReward,
-        expert: Callable[[TensorDictBase], bool] | None = None,
+        experts: Callable[[Sequence[TensorDictBase]], Tensor] | None = None,
         longest: int | None = None,
     ):
         step, remaining = rows["step"], rows["remaining"]
         self.rows, self.gamma, self.reward, self.longest = rows, gamma, reward, longest
-        self.expert = expert if reward.expert is None else reward.expert
+        self.experts = experts
         self.row = torch.arange(len(step), device=step.device)
         self.last = self.row + remaining
         starts = self.row[step == 0]
@@ -272,12 +272,11 @@ class GoalTable:
     def _experts(self, near: Tensor, hits: Tensor) -> Tensor:
         reaches = torch.zeros(len(self.lengths), dtype=torch.bool, device=hits.device)
         reaches[self.episode[hits]] = True
-        if self.expert is None or repr(self.expert) == "reaches_goal()" or not reaches.any():
+        if self.experts is None or not reaches.any():
             return reaches
         steps = self.rows.copy().set(("next", "reward"), near.float()[:, None])
         episodes = steps[reaches[self.episode]].split(self.lengths[reaches].tolist())
-        chosen = select_episodes(self.expert, episodes)
-        return reaches.masked_scatter(reaches, chosen.to(reaches.device))
+        return reaches.masked_scatter(reaches, self.experts(episodes).to(reaches.device))
 
 
 def _following(rows: TensorDictBase, key: Any, remaining: Tensor) -> Tensor:
