@@ -11,11 +11,11 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase, dispatch
 from tensordict.utils import NestedKey
 from torch import Tensor
-from torchrl.data.tensor_specs import Unbounded
 from torchrl.envs.transforms import TensorDictPrimer
 
 from torchrl_rad.data.database import ExpertDatabase
 from torchrl_rad.data.experts import select_episodes
+from torchrl_rad.modules.kept import KEPT, keep_or_renew, kept_primer
 from torchrl_rad.retrieval.goal_rules import GoalRule
 from torchrl_rad.retrieval.goals import GoalReward, GoalTable
 from torchrl_rad.retrieval.rules import TargetRule, followed_rule, highest_rule
@@ -24,7 +24,6 @@ __all__ = ["RetrievalTargetModule"]
 
 OUT_KEYS = ("target", "found", "similarity", "target_return", "target_index")
 QUERIES = 4096  # asked at a time: each has k neighbours
-KEPT = ("retrieval", "kept")  # float64 [*B, 5]: row, similarity, offset, age, version
 
 
 class _Columns(NamedTuple):
@@ -302,31 +301,12 @@ class RetrievalTargetModule(TensorDictModuleBase):
     def _kept(
         self, tensordict: TensorDictBase, query: Tensor, goals: Tensor | None
     ) -> tuple[Tensor, Tensor, Tensor]:
-        kept, start = tensordict.get(KEPT), tensordict.get("is_init")
-        if kept is None or start is None:
-            raise KeyError(
-                f"retrieval_interval={self.retrieval_interval} needs 'is_init' and {KEPT} in the "
-                "tensordict; add InitTracker() and make_tensordict_primer() to the environment."
-            )
-        index, _, _, age, version = kept.reshape(-1, 5).unbind(-1)
-        fresh = start.reshape(-1) | (age >= self.retrieval_interval) | (age == 0)
-        # nothing to keep: no target yet, a row that is gone or moved, a state that is none
-        fresh |= (
-            (version != self.database.version)
-            | (index < 0)
-            | (index >= len(self.database))
-            | ~query.isfinite().all(-1)
-        )
-        # a kept target comes one recorded step nearer with each step
-        state = kept.reshape(-1, 5) + kept.new_tensor([0.0, 0.0, -1.0, 1.0, 0.0])
-        state[:, 2].clamp_min_(0.0)
-        if fresh.any():
-            found = self.select(query[fresh], None if goals is None else goals[fresh])
-            renewed = torch.stack([value.double() for value in found], -1)
-            age_and_version = renewed.new_tensor([1.0, self.database.version])
-            state[fresh] = torch.cat([renewed, age_and_version.expand(len(renewed), 2)], -1)
-        tensordict.set(("next", *KEPT), state.reshape(kept.shape))
-        return state[:, 0].long(), state[:, 1].float(), state[:, 2].long()
+        def select(which: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+            return self.select(query[which], None if goals is None else goals[which])
+
+        finite, database = query.isfinite().all(-1), self.database
+        content = (len(database), database.version)
+        return keep_or_renew(tensordict, finite, self.retrieval_interval, *content, select)
 
     @property
     def make_tensordict_primer(self) -> Callable[[], TensorDictPrimer]:
@@ -336,11 +316,7 @@ class RetrievalTargetModule(TensorDictModuleBase):
         """
         if self.retrieval_interval == 1:
             raise AttributeError("make_tensordict_primer: retrieval_interval=1 keeps nothing")
-        return self._primer
-
-    def _primer(self) -> TensorDictPrimer:
-        spec = Unbounded((5,), dtype=torch.float64)
-        return TensorDictPrimer({KEPT: spec}, default_value=0.0, expand_specs=True)
+        return kept_primer
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "_columns": None}
