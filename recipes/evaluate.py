@@ -29,7 +29,8 @@ from torchrl_rad.runs import RunFolder
 
 torchrl_logger.setLevel(logging.WARNING)
 
-THRESHOLD = 0.7  # for goals: with 0.8 a policy that overshoots a goal may not find back
+# for goals: with 0.8 a policy that overshoots may not find back, with 0.7 it looks around corners
+THRESHOLD = 0.75
 
 
 def cell(text: str) -> tuple[int, int]:

@@ -116,7 +116,7 @@ def test_time_limit():
 def test_what_is_kept(steps):
     inner = {("next", "observation"), ("next", "reward"), ("next", "done")}
     read = {"observation", "target", "found", "similarity", "target_index", "target_step"}
-    assert set(steps.keys(True, True)) == read | inner
+    assert set(steps.keys(True, True)) == read | inner | {"action"}
     assert torch.equal(steps["observation"][1, :, 1], torch.arange(7.0))
     assert torch.equal(steps["next", "observation"][1, :, 1], torch.arange(1.0, 8.0))
 
@@ -126,7 +126,7 @@ def test_policy_that_retrieves_nothing():
         return tensordict.set("action", torch.zeros(4, 1))
 
     kept = evaluate(rows(), plain, 20)
-    assert set(kept.keys()) == {"observation", "next"}
+    assert set(kept.keys()) == {"observation", "action", "next"}
     assert "found" not in episode_results(kept)
 
 

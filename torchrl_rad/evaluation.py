@@ -40,7 +40,7 @@ def evaluate(
         progress (callable, optional): called at each step.
 
     Returns:
-        TensorDict [n, T] with ``observation``, what TS and SE wrote, and under ``"next"``
+        TensorDict [n, T] with ``observation``, ``action``, the goal, what TS and SE wrote, and under ``"next"``
         ``observation``, ``reward``, ``done``. Steps after a row's end have ``done`` True.
 
     Examples:
