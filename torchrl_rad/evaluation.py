@@ -40,8 +40,9 @@ def evaluate(
         progress (callable, optional): called at each step.
 
     Returns:
-        TensorDict [n, T] with ``observation``, ``action``, the goal, what TS and SE wrote, and under ``"next"``
-        ``observation``, ``reward``, ``done``. Steps after a row's end have ``done`` True.
+        TensorDict [n, T] with ``observation``, ``action``, the goal, what TS and SE wrote, and
+        under ``"next"`` ``observation``, ``reward``, ``done``. Steps after a row's end have
+        ``done`` True.
 
     Examples:
         >>> from torchrl.envs import GymEnv, SerialEnv
