@@ -275,30 +275,30 @@ class ExpertDatabase(SavedReplayBuffer):
         Raises:
             KeyError: an id that is not there; nothing is removed then.
         """
-        wanted = torch.as_tensor(list(episodes), dtype=torch.int64)
         with self._replay_lock, self._write_lock:
-            ids = self._storage[:]["episode"].cpu() if len(self) else wanted.new_zeros(0)
-            unknown = wanted[~torch.isin(wanted, ids)]
-            if len(unknown):
-                raise KeyError(
-                    f"episodes {unknown.tolist()} are not in the database, which holds "
-                    f"{len(ids.unique())} others."
-                )
-            gone = torch.isin(ids, wanted)
-            if gone.any():
-                self._remove(gone)
-            return int(gone.sum())
+            return self._remove(self._rows_of(episodes))
 
     def keep(self, episodes: Iterable[int]) -> int:
         """Removes all demonstrations but these; see :meth:`forget`."""
-        wanted = {int(number) for number in episodes}
-        known = set(self._storage[:]["episode"].tolist()) if len(self) else set()
-        if wanted - known:
-            raise KeyError(f"episodes {sorted(wanted - known)} are not in the database.")
-        return self.forget(known - wanted)
+        with self._replay_lock, self._write_lock:
+            return self._remove(~self._rows_of(episodes))
 
-    def _remove(self, gone: Tensor) -> None:
-        """Closes the gaps that some rows, bool [N], leave."""
+    def _rows_of(self, episodes: Iterable[int]) -> Tensor:
+        """Which rows are of some episodes, bool [N] on the CPU."""
+        wanted = torch.as_tensor(list(episodes), dtype=torch.int64)
+        ids = self._storage[:]["episode"].cpu() if len(self) else wanted.new_zeros(0)
+        unknown = wanted[~torch.isin(wanted, ids)]
+        if len(unknown):
+            raise KeyError(
+                f"episodes {unknown.tolist()} are not in the database, which holds "
+                f"{len(ids.unique())} others."
+            )
+        return torch.isin(ids, wanted)
+
+    def _remove(self, gone: Tensor) -> int:
+        """Closes the gaps that some rows, bool [N], leave; gives their number."""
+        if not gone.any():
+            return 0
         if type(self._storage) is TensorStorage:
             raise RuntimeError(
                 "a database opened with memmap=True cannot change; open it with loads(path)."
@@ -310,6 +310,7 @@ class ExpertDatabase(SavedReplayBuffer):
             super().extend(kept.exclude("index"))
         self.version += 1
         self._saved = None
+        return int(gone.sum())
 
     # asking
 
