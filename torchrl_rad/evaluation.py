@@ -14,7 +14,14 @@ from tensordict.nn import TensorDictSequential
 from torch import Tensor
 from torchrl.envs import EnvBase
 
-__all__ = ["episode_results", "evaluate", "interval", "measure_latency", "summarise"]
+__all__ = [
+    "episode_results",
+    "evaluate",
+    "interval",
+    "measure_latency",
+    "steps_inside",
+    "summarise",
+]
 
 KEPT = (
     "observation", "goal", "action", "target", "found", "similarity", "target_return",
@@ -71,6 +78,19 @@ def evaluate(
     return TensorDict({**{key: steps[key] for key in kept}, "next": following}, steps.batch_size)
 
 
+def steps_inside(steps: TensorDictBase) -> np.ndarray:
+    """Which steps [n, T] belong to an episode: those up to its first ``done``, that one included.
+
+    Examples:
+        >>> done = torch.tensor([[False, True, False]]).unsqueeze(-1)
+        >>> steps_inside(TensorDict({"next": {"done": done}}, [1, 3]))
+        array([[ True,  True, False]])
+    """
+    done = steps["next", "done"].squeeze(-1).cpu().numpy()
+    length = np.where(done.any(1), done.argmax(1) + 1, done.shape[1])
+    return np.arange(done.shape[1]) < length[:, None]
+
+
 def episode_results(steps: TensorDictBase) -> dict[str, np.ndarray]:
     """What each episode came to, up to its first ``done``, that step included.
 
@@ -91,10 +111,9 @@ def episode_results(steps: TensorDictBase) -> dict[str, np.ndarray]:
         >>> [float(results[key][0].round(2)) for key in ("return", "length", "arrival", "share")]
         [2.0, 4.0, 2.0, 0.67]
     """
-    done = steps["next", "done"].squeeze(-1).cpu().numpy()
     reward = steps["next", "reward"].squeeze(-1).cpu().double().numpy()
-    length = np.where(done.any(1), done.argmax(1) + 1, done.shape[1])
-    inside = np.arange(done.shape[1]) < length[:, None]
+    inside = steps_inside(steps)
+    length = inside.sum(1)
     paid = (reward > 0) & inside
     success = paid.any(1)
     arrival = np.where(success, paid.argmax(1) + 1.0, np.nan)

@@ -11,7 +11,7 @@ import numpy as np
 from tensordict import TensorDictBase
 
 from torchrl_rad._files import write_atomic
-from torchrl_rad.evaluation import episode_results
+from torchrl_rad.evaluation import episode_results, steps_inside
 
 __all__ = ["demonstration_usage", "provenance_table", "write_provenance"]
 
@@ -39,9 +39,7 @@ def provenance_table(steps: TensorDictBase) -> dict[str, np.ndarray]:
             "the steps hold no 'target_source': ask RetrievalTargetModule for it by a seventh "
             "out_key."
         )
-    done = steps["next", "done"].squeeze(-1).cpu().numpy()
-    last = np.where(done.any(1), done.argmax(1), done.shape[1])
-    inside = np.arange(done.shape[1]) <= last[:, None]
+    inside = steps_inside(steps)
     row, step = inside.nonzero()
 
     def column(name: str) -> np.ndarray:
