@@ -17,6 +17,7 @@ from torchrl.envs import DoubleToFloat, GymWrapper, SerialEnv, TransformedEnv
 from torchrl.envs.transforms import Compose, InitTracker
 
 from torchrl_rad.envs.adapter import ObservationAdapter
+from torchrl_rad.retrieval.goals import GoalReward
 
 __all__ = ["MAZES", "FixedGoalMaze", "MazeTask", "make_maze_env", "maze_task", "relabel_goal"]
 
@@ -180,8 +181,7 @@ def relabel_goal(episodes: TensorDictBase, goal: np.ndarray | Tensor) -> TensorD
         [1.0, 0.0]
     """
     goal = torch.as_tensor(np.asarray(goal), dtype=torch.float32)
-    position = episodes["next", "observation"][..., :2]
-    reward = ((position - goal).norm(dim=-1, keepdim=True) <= GOAL_RADIUS).float()
+    reward = GoalReward(GOAL_RADIUS)(episodes["next", "observation"], goal).float()[..., None]
     out = episodes.copy()
     out["next"] = TensorDict(
         {**dict(episodes["next"].items()), "reward": reward}, episodes.batch_size

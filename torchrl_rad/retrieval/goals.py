@@ -53,7 +53,7 @@ class GoalReward:
             raise ValueError(f"radius is {self.radius}; it must not be negative.")
 
     def __call__(self, states: Tensor, goal: Tensor) -> Tensor:
-        """Whether states [N, S] are within the radius of a goal [G]: bool [N].
+        """Whether states [..., S] are within the radius of a goal [G]: bool [...].
 
         Raises:
             ValueError: the goal has another width than ``dims``, or than a state at most.
@@ -68,7 +68,7 @@ class GoalReward:
                 f"a goal has {width} entries, compared with entries {dims} of a state of "
                 f"{states.shape[-1]}; pass goals of that width, or GoalReward(dims=...)."
             )
-        return states[:, dims]
+        return states[..., dims]
 
     def reached(self, places: Tensor, goal: Tensor) -> Tensor:
         """As a call, of what :meth:`places` gave."""
