@@ -33,6 +33,7 @@ class JointIndex(SearchIndex):
         self.border = len(first.rows)
 
     def candidates(self, query: Tensor, k: int) -> Candidates:
+        """As :meth:`SearchIndex.candidates`."""
         one = self.first.candidates(query, min(k, self.border))
         other = self.second.candidates(query, min(k, len(self.second.rows)))
         other = other._replace(row=other.row + self.border)
@@ -50,6 +51,7 @@ class JointIndex(SearchIndex):
         return Candidates(score, row, error, torch.zeros_like(error))
 
     def order(self, found: Candidates, query: Tensor, k: int) -> tuple[Tensor, Tensor]:
+        """As :meth:`SearchIndex.order`."""
         query = query.double()
         near, index, least = ordered(found, query, self.rows, self.metric, k)
         doubt = ~(found.score[:, -1] < least)

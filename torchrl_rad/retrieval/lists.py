@@ -74,6 +74,7 @@ class ListIndex(SearchIndex):
         self.pause = self.waited = 0
 
     def order(self, found: Candidates, query: Tensor, k: int) -> tuple[Tensor, Tensor]:
+        """As :meth:`SearchIndex.order`."""
         query = query.double()
         near, index, least = ordered(found, query, self.rows, self.metric, k)
         doubt = ~(found.score[:, -1] < least)
@@ -82,6 +83,7 @@ class ListIndex(SearchIndex):
         return near, index
 
     def candidates(self, query: Tensor, k: int) -> Candidates:
+        """As :meth:`SearchIndex.candidates`."""
         query, kept = query.double(), self.scan.kept(k)
         longest = min(LIST_ENTRIES // max(1, query.numel()), len(self.rows) // SHARE)
         if longest < max(kept, ENOUGH * k) or len(query) == 0 or self.waited < self.pause:

@@ -61,11 +61,13 @@ class RankedRule(NamedTuple):
     def choose(
         self, sampler: RetrievalSampler, storage: Any, query: Tensor, goals: Tensor | None = None
     ) -> Choice:
+        """As :meth:`TargetRule.choose`."""
         # the order of all neighbours is not needed
         row, near, hit = sampler.best(storage, query, self.rank)
         return Choice(self.target.index_select(0, row.clamp_min(0)), row, near, hit)
 
     def value(self, rows: Tensor, goals: Tensor | None = None) -> Tensor:
+        """As :meth:`TargetRule.value`."""
         return self.values.index_select(0, rows)
 
 
@@ -100,6 +102,7 @@ class TolerantRule:
     def choose(
         self, sampler: RetrievalSampler, storage: Any, query: Tensor, goals: Tensor | None = None
     ) -> Choice:
+        """As :meth:`TargetRule.choose`."""
         rows, near = sampler.nearest(storage, query)  # [Q, k]
         valid = near >= sampler.threshold
         target, place = self(rows.clamp_min(0), valid)
@@ -108,6 +111,7 @@ class TolerantRule:
         return Choice(target, rows.gather(-1, place)[:, 0], near.gather(-1, place)[:, 0], hit)
 
     def value(self, rows: Tensor, goals: Tensor | None = None) -> Tensor:
+        """As :meth:`TargetRule.value`."""
         return self.table.values.index_select(0, rows)
 
     def __call__(self, rows: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:

@@ -60,6 +60,7 @@ class ScanIndex(SearchIndex):
         self.offset = self.offset.to(self.factors)
 
     def order(self, found: Candidates, query: Tensor, k: int) -> tuple[Tensor, Tensor]:
+        """As :meth:`SearchIndex.order`."""
         query = query.double()
         near, index, least = ordered(found, query, self.rows, self.metric, k)
         for row in (~(found.score[:, -1] < least)).nonzero().flatten().tolist():  # ties, mostly
@@ -67,6 +68,7 @@ class ScanIndex(SearchIndex):
         return near, index
 
     def candidates(self, query: Tensor, k: int) -> Candidates:
+        """As :meth:`SearchIndex.candidates`."""
         query = query.double()
         score, index = self.best(query, self.kept(k))
         square = query.square().sum(-1)
@@ -151,6 +153,7 @@ class TreeIndex(SearchIndex):
         )
 
     def order(self, found: Candidates, query: Tensor, k: int) -> tuple[Tensor, Tensor]:
+        """As :meth:`SearchIndex.order`."""
         if found.score[:, -1:].isinf().any():  # too far for the tree, which then finds nothing
             return ScanIndex(self.rows, self.metric).search(query, k)
         query = query.double()
@@ -164,6 +167,7 @@ class TreeIndex(SearchIndex):
         return near[:, :k], index[:, :k]
 
     def candidates(self, query: Tensor, k: int) -> Candidates:
+        """As :meth:`SearchIndex.candidates`."""
         query, wanted = query.double(), min(k + 1, len(self.rows))
         distance, row = self.tree.query(query.numpy(), k=wanted)
         distance, row = distance.reshape(len(query), wanted), row.reshape(len(query), wanted)
