@@ -63,9 +63,9 @@ def expert_of(name):
     return rule and (lambda episode: rule(episode["next", "reward"][:, 0].tolist()))
 
 
-def assert_equals_oracle(made, queries, goals, radius, expert, first_visit, rule, **limits):
+def assert_equals_oracle(made, asked, width, radius, expert, first_visit, rule, **limits):
     database, following, search = made
-    dims = len(goals[0])
+    queries, goals = [list(a[:2]) for a in asked], [list(a[2 : 2 + width]) for a in asked]
     reward = GoalReward(radius, first_visit=first_visit, expert=expert_of(expert))
     module = RetrievalTargetModule(
         database, rule=rule, goal_key="goal", goal_reward=reward, out_keys=NAMES,
@@ -87,8 +87,8 @@ def assert_equals_oracle(made, queries, goals, radius, expert, first_visit, rule
             expected["similarity"] = ranking(state, columns["observation"], "euclidean")[0][0]
         expected["similarity"] = torch.tensor(expected["similarity"]).item()
         got = {name: out[name][number].tolist() for name in NAMES}
-        assert got.pop("target") == expected.pop("target"), (number, dims)
-        assert {name: value for name, (value,) in got.items()} == expected, (number, dims)
+        assert got.pop("target") == expected.pop("target"), (number, width)
+        assert {name: value for name, (value,) in got.items()} == expected, (number, width)
 
 
 places = st.sampled_from([-1.0, -0.5, 0.0, 0.5])
@@ -108,9 +108,8 @@ asked = st.lists(
     ahead=st.integers(0, 8),
 )
 def test_followed_equals_oracle(made, asked, width, radius, expert, first_visit, ahead):
-    queries, goals = [list(a[:2]) for a in asked], [list(a[2 : 2 + width]) for a in asked]
     limits = {"rule": "followed", "ahead": ahead}
-    assert_equals_oracle(made, queries, goals, radius, expert, first_visit, **limits)
+    assert_equals_oracle(made, asked, width, radius, expert, first_visit, **limits)
 
 
 @settings(max_examples=150, deadline=None)
@@ -125,9 +124,8 @@ def test_followed_equals_oracle(made, asked, width, radius, expert, first_visit,
     least=st.integers(0, 3),
 )
 def test_highest_equals_oracle(made, asked, width, radius, expert, first_visit, horizon, least):
-    queries, goals = [list(a[:2]) for a in asked], [list(a[2 : 2 + width]) for a in asked]
     limits = {"rule": "highest", "horizon": horizon, "min_offset": min(least, horizon - 1)}
-    assert_equals_oracle(made, queries, goals, radius, expert, first_visit, **limits)
+    assert_equals_oracle(made, asked, width, radius, expert, first_visit, **limits)
 
 
 def walk(episodes=20, length=30, seed=0, gamma=0.9, **search):
