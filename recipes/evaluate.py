@@ -18,6 +18,7 @@ from torchrl._utils import logger as torchrl_logger
 
 from torchrl_rad import ExpertDatabase, make_maze_env, maze_task, with_goals
 from torchrl_rad.checkpoint import CheckpointError, read_json
+from torchrl_rad.envs.maze import maze_cell
 from torchrl_rad.evaluation import episode_results
 from torchrl_rad.experiment import collect_episodes, make_data, make_database, policy_row
 from torchrl_rad.plots import plot_followed
@@ -33,12 +34,6 @@ torchrl_logger.setLevel(logging.WARNING)
 THRESHOLD = 0.75
 
 
-def cell(text: str) -> tuple[int, int]:
-    """``"3,1"`` -> (3, 1)."""
-    row, column = text.split(",")
-    return int(row), int(column)
-
-
 def parse() -> argparse.Namespace:
     """The command line."""
     parser = argparse.ArgumentParser(description="Scores a saved policy.")
@@ -48,7 +43,11 @@ def parse() -> argparse.Namespace:
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--precision", default="auto", choices=("auto", "bf16", "fp16", "fp32"))
     parser.add_argument(
-        "--goals", type=cell, nargs="+", metavar="ROW,COLUMN", help="goal cells in place of its own"
+        "--goals",
+        type=maze_cell,
+        nargs="+",
+        metavar="ROW,COLUMN",
+        help="goal cells in place of its own",
     )
     parser.add_argument(
         "--database", help="folder of the demonstrations; with --goals all steps that the run "
@@ -74,8 +73,9 @@ def load(arguments: argparse.Namespace) -> TensorDictSequential:
     policy = load_policy(arguments.folder, other)
     if not arguments.goals:
         return policy
-    if len(policy) == 1:
-        raise ValueError(f"the policy in {arguments.folder} retrieves nothing: it has no goals.")
+    if len(policy) == 1:  # without targets it goes the same way whatever the goal
+        policy[-1].candidates = 1
+        return policy
     database = other or recorded_steps(Path(arguments.folder), policy[0].database)
     return with_goals(policy, database)
 
@@ -90,6 +90,8 @@ def main() -> None:
         task = maze_task(read_json(f"{arguments.folder}/policy.json")["maze"])
         if count < 1:
             raise ValueError(f"--episodes is {count}; at least one is needed.")
+        if len(policy) == 1 and (arguments.csv or arguments.picture):
+            raise ValueError(f"the policy in {arguments.folder} retrieves nothing to write down.")
         cells = [goal for goal in goals for _ in range(count)]
         env = make_maze_env(task, len(cells), goal_cell=cells, show_goal=bool(arguments.goals))
     except (CheckpointError, FileNotFoundError, KeyError, ValueError) as error:

@@ -1,6 +1,7 @@
 """Starts with a few demonstrations and adds the policy's own good episodes; nothing is trained.
 
 python recipes/growth.py outputs/pointmaze-medium/<run>/policies/followed --start 3 --rounds 20
+python recipes/growth.py outputs/pointmaze-medium/<run>/policies/followed --start 1 3 10 --rounds 1
 """
 
 from __future__ import annotations
@@ -8,32 +9,34 @@ from __future__ import annotations
 import argparse
 import logging
 import sys
-import time
 from pathlib import Path
 from typing import Any
 
 import torch
 from tensordict import TensorDictBase
+from tensordict.nn import TensorDictSequential
 from torchrl._utils import logger as torchrl_logger
 from torchrl.data import LazyTensorStorage
 
 from torchrl_rad import ExpertDatabase, RetrievalSampler, make_maze_env, maze_task, reaches_goal
+from torchrl_rad._files import staged_folder
 from torchrl_rad.checkpoint import CheckpointError, read_json, write_json
 from torchrl_rad.data import episode_lengths
 from torchrl_rad.data.experts import select_episodes
-from torchrl_rad.evaluation import episode_results
+from torchrl_rad.evaluation import episode_results, interval
 from torchrl_rad.experiment import collect_episodes, make_data
 from torchrl_rad.plots import plot_growth
 from torchrl_rad.policy import load_policy
 from torchrl_rad.precision import planning_dtype
+from torchrl_rad.provenance import demonstration_usage
 from torchrl_rad.runs import RunFolder, environment_facts
 
 torchrl_logger.setLevel(logging.WARNING)
 
 COLUMNS = ("observation", "action", *(("next", name) for name in ("observation", "reward", "done")))
 LINE = (
-    "{seen:5d} seen, {demonstrations:4d} demonstrations: score {score:6.1f}, {success:.2f} "
-    "arriving, {found:.3f} found"
+    "{seen:5d} seen, {demonstrations:4d} demonstrations: score {score:6.1f} +- {interval:4.1f}, "
+    "{success:.2f} arriving, {found:.3f} found"
 )
 
 
@@ -41,25 +44,33 @@ def parse() -> argparse.Namespace:
     """The command line."""
     parser = argparse.ArgumentParser(description="Lets a database grow by the policy's episodes.")
     parser.add_argument("folder", help="policy folder, such as <run folder>/policies/followed")
-    parser.add_argument("--start", type=int, default=3, help="demonstrations to begin with")
-    parser.add_argument("--rounds", type=int, default=20)
+    parser.add_argument(
+        "--start", type=int, nargs="+", default=[3], help="demonstrations to begin with"
+    )
+    parser.add_argument("--rounds", type=int, default=20, help="1: nothing is added")
     parser.add_argument("--rows", type=int, default=10, help="episodes of a round")
     parser.add_argument("--capacity", type=int, default=200_000, help="rows; the worst give way")
+    parser.add_argument(
+        "--prune", action="store_true", help="a round more with the demonstrations of the last one"
+    )
     parser.add_argument("--seed", type=int, default=0, help="of demonstrations, starts and noise")
     parser.add_argument("--threads", type=int, default=2)
-    parser.add_argument("--out", default="growth", help="folder for results.json and growth.png")
+    parser.add_argument("--out", default="growth", help="folder of results; a run goes on there")
     return parser.parse_args()
 
 
-def first_demonstrations(
-    data: TensorDictBase, like: ExpertDatabase, count: int, capacity: int, seed: int
-) -> ExpertDatabase:
-    """A database of some of the recorded episodes that reach the goal, searched as another is."""
+def demonstrations(data: TensorDictBase, seed: int) -> list[TensorDictBase]:
+    """The recorded episodes that reach the goal, in the order in which they are given out."""
     episodes = data.select(*COLUMNS).split(episode_lengths(data).tolist())
     good = select_episodes(reaches_goal(), episodes).nonzero()[:, 0]
-    if not 0 < count <= len(good):
-        raise ValueError(f"--start is {count}; there are {len(good)} demonstrations of the goal.")
     order = torch.randperm(len(good), generator=torch.Generator().manual_seed(seed))
+    return [episodes[i] for i in good[order].tolist()]
+
+
+def database_of(
+    episodes: list[TensorDictBase], like: ExpertDatabase, capacity: int
+) -> ExpertDatabase:
+    """A database of some episodes, searched as another is."""
     database = ExpertDatabase(
         LazyTensorStorage(capacity),
         like.gamma,
@@ -67,7 +78,7 @@ def first_demonstrations(
         RetrievalSampler(**like.sampler.config),
         evict="lowest_return",
     )
-    database.extend(torch.cat([episodes[i] for i in good[order[:count]].tolist()]))
+    database.extend(torch.cat(episodes))
     return database
 
 
@@ -78,31 +89,78 @@ def add(database: ExpertDatabase, steps: TensorDictBase) -> None:
         database.extend(steps[reached].select(*COLUMNS).reshape(-1))
 
 
-def grow(arguments: argparse.Namespace, policy, database, task) -> list[dict[str, Any]]:
-    """Acts and adds, round by round: figures of each."""
-    env, rounds = make_maze_env(task, arguments.rows), []
-    for number in range(arguments.rounds):
-        begin, episodes = time.perf_counter(), len(database[:]["episode"].unique())
+def drive(env, policy, task, seed: int) -> tuple[dict[str, Any], TensorDictBase]:
+    """One round: its figures and its episodes."""
+    held = len(policy[0].database[:]["episode"].unique())
+    name = f"{held} demonstrations"
+    steps = collect_episodes(env, policy, task.max_steps, seed, name, planning_dtype())
+    results = episode_results(steps)
+    scores = task.normalised_score(results["return"])
+    mean, half = interval(scores)
+    figures = {
+        "demonstrations": held,
+        "scores": scores.tolist(),
+        "score": mean,
+        "interval": half,
+        "success": float(results["success"].mean()),
+        "found": float(results["found"].mean()),
+        "followed": [used["episode"] for used in demonstration_usage(steps)],
+    }
+    return figures, steps
+
+
+def grow(arguments: argparse.Namespace, policy, task, folder: Path) -> list[dict[str, Any]]:
+    """Acts and adds, round by round; goes on after the rounds that the folder holds."""
+    database, rounds = policy[0].database, read_rounds(folder)
+    env = make_maze_env(task, arguments.rows)
+    for number in range(len(rounds), arguments.rounds + arguments.prune):
+        pruned = number == arguments.rounds
+        if pruned:
+            database.keep(rounds[-1]["followed"])
+            print("only those that were followed in the last round:", flush=True)
         seed = 10_000 + arguments.seed + number  # other start states each time
-        name = f"round {number + 1}, {episodes} demonstrations"
-        steps = collect_episodes(env, policy, task.max_steps, seed, name, planning_dtype())
-        results = episode_results(steps)
-        scores = task.normalised_score(results["return"]).tolist()
-        add(database, steps)
-        rounds.append(
-            {
-                "seen": number * arguments.rows,
-                "demonstrations": episodes,
-                "scores": scores,
-                "score": sum(scores) / len(scores),
-                "success": float(results["success"].mean()),
-                "found": float(results["found"].mean()),
-                "seconds": time.perf_counter() - begin,
-            }
-        )
+        figures, steps = drive(env, policy, task, seed)
+        rounds.append({"seen": number * arguments.rows, "pruned": pruned, **figures})
         print(LINE.format(**rounds[-1]), flush=True)
+        add(database, steps)
+        with staged_folder(folder, replace=True) as stage:  # both or none
+            database.dumps(stage / "database")
+            write_json(stage / "rounds.json", rounds)
     env.close()
     return rounds
+
+
+def read_rounds(folder: Path) -> list[dict[str, Any]]:
+    """What was done before."""
+    return read_json(folder / "rounds.json") if folder.exists() else []
+
+
+def prepare(arguments: argparse.Namespace, folder: Path) -> list[tuple[TensorDictSequential, Path]]:
+    """For each size to begin with the policy, with its database, and where its rounds are kept."""
+    if min(arguments.rows, arguments.rounds) < 1:
+        raise ValueError("--rows and --rounds are at least 1.")
+    out = Path(arguments.out)
+    settings = {name: getattr(arguments, name) for name in ("rows", "capacity", "seed")}
+    out.mkdir(parents=True, exist_ok=True)
+    about = out / "settings.json"
+    if about.exists() and read_json(about) != settings:
+        raise ValueError(f"{out} is of a run with {read_json(about)}; pass another --out.")
+    _, data = make_data(RunFolder.open(folder.parents[1]).config())
+    good = demonstrations(data, arguments.seed)
+    like, prepared = ExpertDatabase.loads(folder / "database", memmap=True), []
+    for count in arguments.start:
+        if not 0 < count <= len(good):
+            raise ValueError(
+                f"--start is {count}; there are {len(good)} demonstrations of the goal."
+            )
+        kept = out / f"start-{count}"
+        if kept.exists():
+            database = ExpertDatabase.loads(kept / "database")
+        else:
+            database = database_of(good[:count], like, arguments.capacity)
+        prepared.append((load_policy(folder, database).requires_grad_(False), kept))
+    write_json(about, settings)
+    return prepared
 
 
 def main() -> None:
@@ -112,20 +170,15 @@ def main() -> None:
     folder, out = Path(arguments.folder).absolute(), Path(arguments.out)
     try:
         task = maze_task(read_json(folder / "policy.json")["maze"])
-        if min(arguments.rows, arguments.rounds) < 1:
-            raise ValueError("--rows and --rounds are at least 1.")
-        like = ExpertDatabase.loads(folder / "database", memmap=True)
-        _, data = make_data(RunFolder.open(folder.parents[1]).config())
-        chosen = (arguments.start, arguments.capacity, arguments.seed)
-        database = first_demonstrations(data, like, *chosen)
-        policy = load_policy(folder, database).requires_grad_(False)
-        out.mkdir(parents=True, exist_ok=True)
+        prepared = prepare(arguments, folder)
     except (CheckpointError, OSError, KeyError, ValueError) as error:
         sys.exit(f"error: {error.args[0] if isinstance(error, KeyError) else error}")
-    rounds = grow(arguments, policy, database, task)
-    facts = {"settings": vars(arguments), **environment_facts()}
-    write_json(out / "results.json", {"rounds": rounds, **facts})
-    plot_growth(rounds, out / "growth.png")
+    runs = {}
+    for count, (policy, kept) in zip(arguments.start, prepared, strict=True):
+        torch.set_num_threads(arguments.threads)  # closing mazes raises it
+        runs[count] = grow(arguments, policy, task, kept)
+    write_json(out / "results.json", {"runs": runs, **vars(arguments), **environment_facts()})
+    plot_growth(runs, out / "growth.png")
     print(f"\n{out / 'results.json'}, {out / 'growth.png'}")
 
 

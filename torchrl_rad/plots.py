@@ -65,34 +65,40 @@ def plot_curves(rows: Sequence[Mapping[str, float]], path: str | Path) -> None:
     pyplot.close(figure)
 
 
-def plot_growth(rounds: Sequence[Mapping[str, Any]], path: str | Path) -> None:
-    """Draws the score of a growing database against the episodes seen.
+def plot_growth(runs: Mapping[int, Sequence[Mapping[str, Any]]], path: str | Path) -> None:
+    """Draws the scores of databases that begin with so many demonstrations.
+
+    Against the episodes seen where they grow; against their own number where none of them does.
 
     Args:
-        rounds (sequence of mapping): each ``seen``, episodes before it; ``demonstrations``; and
-            ``scores`` of its episodes, of which mean and 95 % interval are drawn.
+        runs (mapping): demonstrations to begin with -> rounds, each ``seen``, episodes before it;
+            ``demonstrations``; and ``scores`` of its episodes, of which mean and 95 % interval are
+            drawn.
         path (path): a png.
 
     Raises:
         ImportError: matplotlib is not installed.
     """
     pyplot = _pyplot()
-    seen = [entry["seen"] for entry in rounds]
-    centre, half = np.array([interval(entry["scores"]) for entry in rounds]).T
     figure, axis = pyplot.subplots(figsize=(5.0, 3.2))
-    axis.fill_between(seen, centre - half, centre + half, color=PATH, alpha=0.2, lw=0)
-    axis.plot(seen, centre, ".-", color=PATH, label="score")
-    axis.set(xlabel="episodes seen", ylabel="score")
-    other = axis.twinx()
-    held = [entry["demonstrations"] for entry in rounds]
-    other.plot(seen, held, "--", color=TARGET, lw=1.2, label="demonstrations")
-    other.set(ylabel="demonstrations in the database", ylim=(0, None))
-    lines = [*axis.get_lines(), *other.get_lines()]
-    figure.legend(
-        lines, [str(x.get_label()) for x in lines], loc="lower center", ncol=2, frameon=False
-    )
+    if all(len(rounds) == 1 for rounds in runs.values()):
+        together = [rounds[0] for rounds in runs.values()]
+        centre, half = np.array([interval(entry["scores"]) for entry in together]).T
+        held = [entry["demonstrations"] for entry in together]
+        axis.errorbar(held, centre, np.nan_to_num(half), fmt=".-", color=PATH, capsize=3)
+        axis.set(xlabel="demonstrations in the database", xscale="log")
+    else:
+        for number, (start, rounds) in enumerate(runs.items()):
+            seen = [entry["seen"] for entry in rounds]
+            centre, half = np.array([interval(entry["scores"]) for entry in rounds]).T
+            low, high = centre - half, centre + half
+            axis.fill_between(seen, low, high, color=f"C{number}", alpha=0.2, lw=0)
+            axis.plot(seen, centre, ".-", color=f"C{number}", label=f"from {start}")
+        axis.set(xlabel="episodes seen")
+        axis.legend(title="demonstrations", frameon=False, fontsize=8)
+    axis.set(ylabel="score")
     axis.grid(alpha=0.3)
-    figure.tight_layout(rect=(0, 0.07, 1, 1))
+    figure.tight_layout()
     figure.savefig(path, dpi=130)
     pyplot.close(figure)
 

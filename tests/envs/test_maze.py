@@ -7,6 +7,7 @@ from tensordict import TensorDict
 from torchrl.envs.utils import check_env_specs
 
 from torchrl_rad.envs import FixedGoalMaze, make_maze_env, maze_task, relabel_goal
+from torchrl_rad.envs.maze import RESET_NOISE
 
 NAMES = ["umaze", "medium", "large"]
 
@@ -257,6 +258,19 @@ def test_a_goal_for_each_row_is_shown():
     state = alone.reset()["observation"]
     alone.close()
     assert torch.equal(td["observation"][:, 0], state)
+
+
+def test_a_start_for_each_row():
+    task = maze_task("medium")
+    cells = [(1, 1), (6, 6), (3, 4)]
+    env = make_maze_env(task, 3, reset_cell=cells)
+    places = env.reset()["observation"][:, :2]
+    env.close()
+    maze = FixedGoalMaze(task).maze
+    centres = torch.tensor([maze.cell_rowcol_to_xy(torch.tensor(cell)).tolist() for cell in cells])
+    assert (places - centres).abs().max() <= RESET_NOISE
+    with pytest.raises(ValueError, match="there are 1 start cells for 3 rows; expected one a row"):
+        make_maze_env(task, 3, reset_cell=[(1, 1)])
 
 
 def test_as_many_goals_as_rows():

@@ -160,9 +160,13 @@ def test_settings_that_are_none(whole, options, message):
     assert code.startswith("error: ") and message in code and out == ""
 
 
-def test_goals_of_a_policy_without_targets(whole):
-    code, _, _ = call(whole[0].path / "policies" / "backbone", "--goals", "3,1")
-    assert "retrieves nothing: it has no goals" in code
+def test_goals_of_a_policy_without_targets(whole, tmp_path):
+    backbone = whole[0].path / "policies" / "backbone"
+    lines = score(backbone, "--episodes", "2", "--goals", "3,1", "1,3")
+    assert "found" not in lines[0] and "umaze (1, 3)" in lines[3]
+    for option in ("--csv", "--picture"):
+        code, _, _ = call(backbone, "--goals", "3,1", option, str(tmp_path / "none"))
+        assert "retrieves nothing to write down" in code
 
 
 def test_goals_of_a_policy_without_its_run(folder):
@@ -173,7 +177,7 @@ def test_goals_of_a_policy_without_its_run(folder):
 @pytest.mark.parametrize("text", ["3", "a,b", "1,2,3"])
 def test_a_goal_that_is_no_cell(folder, text):
     code, _, err = call(folder, "--goals", text)
-    assert code == 2 and f"argument --goals: invalid cell value: '{text}'" in err
+    assert code == 2 and f"argument --goals: invalid maze_cell value: '{text}'" in err
 
 
 if __name__ == "__main__":

@@ -155,6 +155,20 @@ def _cell(name: str, value: Any) -> np.ndarray:
     return cell
 
 
+def maze_cell(text: str) -> tuple[int, int]:
+    """A cell as it is named on a command line.
+
+    Raises:
+        ValueError: the text is not ``row,column``.
+
+    Examples:
+        >>> maze_cell("3,1")
+        (3, 1)
+    """
+    row, column = text.split(",")
+    return int(row), int(column)
+
+
 def free_cells(maze_map: list[list[Any]]) -> np.ndarray:
     """(row, column) of every free cell of a maze map, in reading order: int [n, 2]."""
     return np.asarray(
@@ -195,6 +209,7 @@ def make_maze_env(
     seed: int = 0,
     goal_cell: tuple[int, int] | Sequence[tuple[int, int]] | None = None,
     show_goal: bool = False,
+    reset_cell: tuple[int, int] | Sequence[tuple[int, int]] | None = None,
 ) -> TransformedEnv:
     """A TorchRL environment with ``rows`` independent mazes.
 
@@ -207,10 +222,12 @@ def make_maze_env(
         goal_cell (tuple of int, optional): another goal cell, or a list of one a row.
         show_goal (bool, optional): write x and y of each row's goal into ``goal`` [rows, 2].
             Defaults to ``False``.
+        reset_cell (tuple of int, optional): a fixed start cell, or a list of one a row. Defaults to
+            any cell.
 
     Raises:
-        ValueError: ``rows`` is below 1, there are more or fewer goal cells than rows, or one that
-            cannot be stood on.
+        ValueError: ``rows`` is below 1, there are more or fewer cells than rows, or one that cannot
+            be stood on.
 
     Examples:
         >>> env = make_maze_env(maze_task("umaze"), 2)
@@ -220,18 +237,23 @@ def make_maze_env(
     if rows < 1:
         raise ValueError(f"rows is {rows}; an environment has at least one row.")
 
-    several = isinstance(goal_cell, list)
-    cells: Any = goal_cell if several else [goal_cell] * rows
-    if len(cells) != rows:
-        raise ValueError(f"there are {len(cells)} goal cells for {rows} rows; expected one a row.")
+    goals, starts = _one_a_row("goal", goal_cell, rows), _one_a_row("start", reset_cell, rows)
 
-    def make_row(cell: Any) -> TransformedEnv:
+    def make_row(goal: Any, start: Any) -> TransformedEnv:
         # the cast sits inside each row: outside a batched env it breaks partial steps
-        maze = FixedGoalMaze(task, cell, show_goal=show_goal)
+        maze = FixedGoalMaze(task, goal, start, show_goal=show_goal)
         return TransformedEnv(GymWrapper(maze), DoubleToFloat())
 
-    env = TransformedEnv(
-        SerialEnv(rows, [partial(make_row, cell) for cell in cells]), Compose(InitTracker())
-    )
+    mazes = [partial(make_row, *cells) for cells in zip(goals, starts, strict=True)]
+    env = TransformedEnv(SerialEnv(rows, mazes), Compose(InitTracker()))
     env.set_seed(seed)
     return env
+
+
+def _one_a_row(name: str, cell: Any, rows: int) -> list[Any]:
+    several = cell if isinstance(cell, list) else [cell] * rows
+    if len(several) != rows:
+        raise ValueError(
+            f"there are {len(several)} {name} cells for {rows} rows; expected one a row."
+        )
+    return several

@@ -1,0 +1,167 @@
+"""When a target helps: starts at places that the demonstrations do not cover, with and without.
+
+python recipes/fallback.py outputs/pointmaze-medium/<run>/policies/followed --without 1,1 1,2 2,1
+"""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from tensordict import TensorDictBase
+from torchrl._utils import logger as torchrl_logger
+from torchrl.data import LazyTensorStorage
+
+from torchrl_rad import (
+    ExpertDatabase,
+    RetrievalSampler,
+    make_maze_env,
+    maze_task,
+    reaches_goal,
+    similarity_threshold,
+)
+from torchrl_rad.checkpoint import CheckpointError, read_json, write_json
+from torchrl_rad.data import episode_lengths
+from torchrl_rad.envs import FixedGoalMaze
+from torchrl_rad.envs.maze import maze_cell
+from torchrl_rad.evaluation import episode_results, interval
+from torchrl_rad.experiment import collect_episodes, make_data
+from torchrl_rad.policy import load_policy
+from torchrl_rad.precision import planning_dtype
+from torchrl_rad.runs import RunFolder, environment_facts
+
+torchrl_logger.setLevel(logging.WARNING)
+
+BINS = (0.0, 0.1, 0.25, 0.5, 1.0, np.inf)  # of the distance to the nearest demonstration
+
+
+def parse() -> argparse.Namespace:
+    """The command line."""
+    parser = argparse.ArgumentParser(description="Scores starts off the data.")
+    parser.add_argument("folder", help="policy folder, such as <run folder>/policies/followed")
+    parser.add_argument(
+        "--without", type=maze_cell, nargs="+", metavar="ROW,COLUMN", required=True,
+        help="cells that no demonstration enters",
+    )  # fmt: skip
+    parser.add_argument("--episodes", type=int, default=4, help="of each start cell")
+    parser.add_argument("--level", type=float, default=0.05, help="of the conformal quantile")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--threads", type=int, default=2)
+    parser.add_argument("--out", default="fallback.json")
+    return parser.parse_args()
+
+
+def demonstrations(data: TensorDictBase, maze: Any, without: list[tuple[int, int]]):
+    """Steps of the recorded episodes that do not enter some cells."""
+    centres = torch.tensor(np.stack([maze.cell_rowcol_to_xy(np.array(cell)) for cell in without]))
+    offset = data["observation"][:, None, :2] - centres
+    inside = (offset.abs() <= 0.5).all(-1).any(-1)  # [T]
+    lengths = episode_lengths(data)
+    episode = torch.repeat_interleave(torch.arange(len(lengths)), lengths)
+    enters = torch.zeros(len(lengths), dtype=torch.bool)
+    enters[episode[inside]] = True
+    return data[~enters[episode]].exclude("return_to_go")
+
+
+def database_of(steps: TensorDictBase, like: ExpertDatabase, threshold: float) -> ExpertDatabase:
+    """The demonstrations among recorded steps, with another threshold."""
+    sampler = RetrievalSampler(**{**like.sampler.config, "threshold": threshold})
+    database = ExpertDatabase(LazyTensorStorage(len(steps)), like.gamma, reaches_goal(), sampler)
+    database.extend(steps)
+    return database
+
+
+def drive(arguments, task, policy, cells: list[tuple[int, int]], seed: int, name: str):
+    """An episode from each cell, so many times."""
+    policy[-1].candidates = 1
+    starts = [cell for cell in cells for _ in range(arguments.episodes)]
+    env = make_maze_env(task, len(starts), reset_cell=starts)
+    torch.set_num_threads(arguments.threads)
+    steps = collect_episodes(env, policy, task.max_steps, seed, name, planning_dtype())
+    env.close()
+    torch.set_num_threads(arguments.threads)
+    return steps
+
+
+def calibrated(arguments, task, folder: Path, database: ExpertDatabase, cells) -> float:
+    """The threshold by the policy's own good episodes, in which it never fell back."""
+    policy = load_policy(folder, database)
+    steps = drive(arguments, task, policy, cells, 20_000 + arguments.seed, "to calibrate")
+    good = steps[torch.from_numpy(episode_results(steps)["success"] > 0)]
+    good = good.select("observation", ("next", "reward"), ("next", "done"))
+    return similarity_threshold(database, good.reshape(-1), arguments.level, arguments.seed)
+
+
+def figures(task, steps: TensorDictBase, distance: np.ndarray) -> list[dict[str, Any]]:
+    """Score and fallback rate by the distance of start states from the demonstrations."""
+    results = episode_results(steps)
+    scores = task.normalised_score(results["return"])
+    rows = []
+    for low, high in zip(BINS, BINS[1:], strict=False):
+        here = (distance >= low) & (distance < high)
+        if here.any():
+            mean, half = interval(scores[here])
+            rows.append(
+                {
+                    "distance": [low, None if np.isinf(high) else high],
+                    "episodes": int(here.sum()),
+                    "fallback": float(1 - results["found"][here].mean()),
+                    "start_fallback": float((~steps["found"][here, 0]).float().mean()),
+                    "success": float(results["success"][here].mean()),
+                    "score": mean,
+                    "interval": half,
+                }
+            )
+    return rows
+
+
+def main() -> None:
+    """Reads the command line; errors that a user can mend end in one line."""
+    arguments = parse()
+    torch.set_num_threads(arguments.threads)
+    folder = Path(arguments.folder).absolute()
+    try:
+        task = maze_task(read_json(folder / "policy.json")["maze"])
+        _, data = make_data(RunFolder.open(folder.parents[1]).config())
+        like = ExpertDatabase.loads(folder / "database", memmap=True)
+        maze = FixedGoalMaze(task)
+        for cell in arguments.without:
+            FixedGoalMaze(task, reset_cell=cell).close()  # refuses one that is none
+        if arguments.episodes < 1:
+            raise ValueError(f"--episodes is {arguments.episodes}; at least one is needed.")
+        data = demonstrations(data, maze.maze, arguments.without)
+        always = database_of(data, like, 0.0)
+        if len(always) == 0:
+            raise ValueError("no demonstration is left that enters none of these cells.")
+        similarity_level(arguments.level)
+    except (CheckpointError, OSError, KeyError, ValueError) as error:
+        sys.exit(f"error: {error.args[0] if isinstance(error, KeyError) else error}")
+    cells = [tuple(cell) for cell in maze.free_cells.tolist()]
+    covered = [cell for cell in cells if cell not in arguments.without]
+    threshold = calibrated(arguments, task, folder, always, covered)
+    print(f"calibrated at level {arguments.level}: similarity {threshold:.3f}")
+    databases = {
+        "a target always": always,
+        "calibrated": database_of(data, like, threshold),
+        "no target": ExpertDatabase(sampler=RetrievalSampler(**like.sampler.config)),
+    }
+    table, distance = {}, None
+    for name, database in databases.items():
+        policy = load_policy(folder, database)
+        steps = drive(arguments, task, policy, cells, 30_000 + arguments.seed, name)
+        if distance is None:  # of the same starts in each
+            distance = (1 / steps["similarity"][:, 0, 0].double() - 1).numpy()
+        table[name] = figures(task, steps, distance)
+        for row in table[name]:
+            print(name, row, flush=True)
+    about = {"threshold": threshold, **vars(arguments), **environment_facts()}
+    write_json(arguments.out, {"rows": table, **about})
+
+
+if __name__ == "__main__":
+    main()
