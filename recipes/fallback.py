@@ -57,15 +57,18 @@ def parse() -> argparse.Namespace:
 
 
 def demonstrations(data: TensorDictBase, maze: Any, without: list[tuple[int, int]]):
-    """Steps of the recorded episodes that do not enter some cells."""
+    """Steps of the recorded episodes that reach the goal and do not enter some cells."""
     centres = torch.tensor(np.stack([maze.cell_rowcol_to_xy(np.array(cell)) for cell in without]))
     offset = data["observation"][:, None, :2] - centres
     inside = (offset.abs() <= 0.5).all(-1).any(-1)  # [T]
     lengths = episode_lengths(data)
     episode = torch.repeat_interleave(torch.arange(len(lengths)), lengths)
-    enters = torch.zeros(len(lengths), dtype=torch.bool)
-    enters[episode[inside]] = True
-    return data[~enters[episode]].exclude("return_to_go")
+    kept = torch.zeros(len(lengths), dtype=torch.bool)
+    kept[episode[data["next", "reward"][:, 0] > 0]] = True
+    kept[episode[inside]] = False
+    if not kept.any():
+        raise ValueError("no demonstration is left that enters none of these cells.")
+    return data[kept[episode]].exclude("return_to_go")
 
 
 def database_of(steps: TensorDictBase, like: ExpertDatabase, threshold: float) -> ExpertDatabase:
@@ -132,13 +135,12 @@ def main() -> None:
         maze = FixedGoalMaze(task)
         for cell in arguments.without:
             FixedGoalMaze(task, reset_cell=cell).close()  # refuses one that is none
+        if not 0.0 < arguments.level < 1.0:
+            raise ValueError(f"--level is {arguments.level}; expected a share between 0 and 1.")
         if arguments.episodes < 1:
             raise ValueError(f"--episodes is {arguments.episodes}; at least one is needed.")
         data = demonstrations(data, maze.maze, arguments.without)
         always = database_of(data, like, 0.0)
-        if len(always) == 0:
-            raise ValueError("no demonstration is left that enters none of these cells.")
-        similarity_level(arguments.level)
     except (CheckpointError, OSError, KeyError, ValueError) as error:
         sys.exit(f"error: {error.args[0] if isinstance(error, KeyError) else error}")
     cells = [tuple(cell) for cell in maze.free_cells.tolist()]

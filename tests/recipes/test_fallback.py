@@ -8,7 +8,7 @@ import pytest
 
 from .running import call
 
-WITHOUT = ("--without", "3,3")
+WITHOUT = ("--without", "3,1")
 
 
 def test_scores_by_distance(whole, tmp_path):
@@ -37,7 +37,7 @@ def test_scores_by_distance(whole, tmp_path):
 @pytest.mark.parametrize(
     "options, message",
     [
-        (["--level", "2"], "level is 2.0; expected a share between 0 and 1"),
+        (["--level", "2"], "--level is 2.0; expected a share between 0 and 1"),
         (["--without", "0,0"], "cell (0, 0) of PointMaze_UMaze-v3 is a wall or outside the map"),
         (["--without", "1,1"], "no demonstration is left"),
         (["--episodes", "0"], "--episodes is 0; at least one is needed"),
