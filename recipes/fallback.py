@@ -156,8 +156,9 @@ def main() -> None:
     for name, database in databases.items():
         policy = load_policy(folder, database)
         steps = drive(arguments, task, policy, cells, 30_000 + arguments.seed, name)
-        if distance is None:  # of the same starts in each
-            distance = (1 / steps["similarity"][:, 0, 0].double() - 1).numpy()
+        if distance is None:  # the starts are the same in each
+            starts = steps["observation"][:, 0]
+            distance = (1 / always.sampler.nearest(always.storage, starts, 1)[1] - 1)[:, 0].numpy()
         table[name] = figures(task, steps, distance)
         for row in table[name]:
             print(name, row, flush=True)
