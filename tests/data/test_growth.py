@@ -297,6 +297,11 @@ def test_an_episode_that_comes_twice_is_named():
     with pytest.warns(UserWarning, match=r"1 episodes .* episode 5 has the states of episode 1"):
         made.extend(torch.cat([episodes((2,), 3, ids=[4]), episodes((4, 3), ids=[8, 5])[4:]]))
     assert made.forget([5]) == 3
+    twice = torch.cat([episodes((2,), 9, ids=[6]), episodes((2,), 9, ids=[7])])
+    with pytest.warns(UserWarning, match=r"1 episodes .* episode 7 has the states of episode 6"):
+        made.extend(twice)
+    with pytest.warns(UserWarning, match=r"1 episodes .* episode 7 has the states of episode 6"):
+        ExpertDatabase(LazyTensorStorage(9)).extend(twice)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         made.extend(episodes((4, 3), seed=7))

@@ -529,6 +529,40 @@ def lines(select, *limits):
     return TransformedEnv(env, Compose(InitTracker(), select.make_tensordict_primer()))
 
 
+def test_a_collector_fills_the_database_that_it_asks_with_goals():
+    reward = GoalReward(radius=0.1)
+    made = database(capacity=200, k=3, threshold=0.5)
+    select = module(made, rule="followed", ahead=4, goal_key="goal", goal_reward=reward)
+    to = TensorDictModule(lambda state: torch.full_like(state, 5.0), ["observation"], ["goal"])
+    act = TensorDictModule(torch.zeros_like, ["observation"], ["action"])
+    env = TransformedEnv(SerialEnv(2, [partial(Line, 12)] * 2), InitTracker())
+    policy = TensorDictSequential(to, select, act)
+    collector = Collector(env, policy, frames_per_batch=24, total_frames=96)
+    stop, faults, found = threading.Event(), [], []
+
+    def ask_beside():
+        other = copy.copy(select)
+        while not stop.is_set():
+            out = ask_goals(other, [[2.0], [2.0]], [[5.0], [99.0]])
+            found.append(bool(out["found"][0]))
+            right = not out["found"][1] and (not found[-1] or float(out["target"][0]) == 4.0)
+            faults.extend([] if right else [out])
+
+    thread = threading.Thread(target=ask_beside)
+    thread.start()
+    shares = []
+    for number, batch in enumerate(collector):
+        shares.append(float(batch["found"].float().mean()))
+        made.extend(batch.select("observation", ("next", "reward"), ("next", "done")).reshape(-1))
+        assert len(made) == 24 * (number + 1)
+    stop.set()
+    thread.join()
+    collector.shutdown()
+    assert not faults and found[-1]
+    # nothing was known in the first batch; then what it had recorded itself
+    assert shares == [0.0, 1.0, 1.0, 1.0]
+
+
 def test_each_row_keeps_its_target_by_its_own_clock():
     select = module(places(), retrieval_interval=3)
     policy = TensorDictSequential(select, still)

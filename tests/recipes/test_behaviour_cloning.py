@@ -32,4 +32,4 @@ def test_clones_the_ways_to_a_goal():
 )
 def test_settings_that_are_none(options, message):
     code, _, err = call("behaviour_cloning.py", *options, "--episodes", "1")
-    assert code == 1 and err.startswith("error: ") and message in err
+    assert code == 1 and f"error: {message}" in err

@@ -185,14 +185,15 @@ class ExpertDatabase(SavedReplayBuffer):
             for name in kept_names(self._storage[:]):  # of before relabelling: as they are now
                 steps.set((name, "reward"), steps["next", "reward"])
                 steps.set((name, "return_to_go"), value)
-            again = copies(self._storage[:], steps, self._sampler.key)
-            if again:
-                warnings.warn(
-                    f"{len(again)} episodes are in the database already and now count twice: "
-                    f"episode {again[0][0]} has the states of episode {again[0][1]}. "
-                    f"forget([{again[0][0]}]) removes it.",
-                    stacklevel=3,
-                )
+        again = copies(self._storage[:] if len(self) else steps[:0], steps, self._sampler.key)
+        if again:
+            number, other = again[0]
+            warnings.warn(
+                f"{len(again)} episodes are in the database already and now count twice: "
+                f"episode {number} has the states of episode {other}. "
+                f"forget([{number}]) removes it.",
+                stacklevel=3,
+            )
         return steps
 
     def _experts(self, steps: TensorDictBase, lengths: Tensor) -> TensorDictBase:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections import defaultdict
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import torch
@@ -105,29 +106,30 @@ def evicted(rows: TensorDictBase, needed: int, rule: str) -> Tensor:
 
 
 def copies(rows: TensorDictBase, steps: TensorDictBase, key: Any) -> list[tuple[int, int]]:
-    """Episodes among ``steps`` that have the states of one among ``rows``: (theirs, that one's).
+    """Episodes among ``steps`` with the states of one among ``rows``, or of one before them.
 
     Both have the columns of a database.
+
+    Returns:
+        Ids: of the episode that came again, and of the one that it repeats.
     """
-    known = _by_ends(rows, key)
+    known: dict[tuple, list[tuple[int, Tensor]]] = defaultdict(list)
     found = []
-    for ends, (begin, length) in _by_ends(steps, key).items():
-        if ends not in known:
-            continue
-        other, _ = known[ends]
-        one, same = (table.get(key)[i : i + length] for table, i in ((steps, begin), (rows, other)))
-        if torch.equal(one, same):
-            found.append((int(steps["episode"][begin]), int(rows["episode"][other])))
+    for table, new in ((rows, False), (steps, True)):
+        for ends, number, states in _episodes(table, key):
+            same = next((other for other, its in known[ends] if torch.equal(its, states)), None)
+            if new and same is not None:
+                found.append((number, same))
+            known[ends].append((number, states))
     return found
 
 
-def _by_ends(rows: TensorDictBase, key: Any) -> dict[tuple, tuple[int, int]]:
-    """First row and length of each episode, under its length, first and last state."""
+def _episodes(rows: TensorDictBase, key: Any) -> Iterator[tuple[tuple, int, Tensor]]:
+    """Of each episode its length, first and last state; its id; its states."""
     lengths = stored_lengths(rows)
     start = lengths.cumsum(0) - lengths
     states = rows.get(key)
     ends = torch.cat([states[start], states[start + lengths - 1]], -1).tolist()
-    places = zip(start.tolist(), lengths.tolist(), strict=True)
-    return {
-        (length, *end): (begin, length) for (begin, length), end in zip(places, ends, strict=True)
-    }
+    ids = rows["episode"][start].tolist()
+    for number, end, own in zip(ids, ends, states.split(lengths.tolist()), strict=True):
+        yield (len(own), *end), number, own
