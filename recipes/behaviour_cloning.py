@@ -25,7 +25,7 @@ from torchrl_rad.envs import FixedGoalMaze
 from torchrl_rad.envs.maze import maze_cell
 from torchrl_rad.evaluation import episode_results, summarise
 from torchrl_rad.experiment import collect_episodes
-from torchrl_rad.results import format_table, score_source
+from torchrl_rad.results import format_table
 from torchrl_rad.training import Objective
 
 torchrl_logger.setLevel(logging.WARNING)
@@ -87,7 +87,7 @@ def main() -> None:
     row = summarise(episode_results(steps), task.normalised_score)
     print(f"{len(data)} steps on the way to {arguments.goal or task.goal_cell}")
     print(format_table({name: row}))
-    print(f"\n{score_source(task)}")
+    print(f"\n{task.score_source}")
 
 
 if __name__ == "__main__":

@@ -41,7 +41,7 @@ from torchrl_rad.experiment import (
 from torchrl_rad.plots import plot_curves, plot_targets
 from torchrl_rad.policy import save_policy
 from torchrl_rad.precision import uses_bf16
-from torchrl_rad.results import format_table, score_source
+from torchrl_rad.results import format_table
 from torchrl_rad.runs import RunFolder
 from torchrl_rad.training import Interrupted, Objective, train
 
@@ -123,7 +123,7 @@ def run_training(run: RunFolder, cfg: dict[str, Any], policies, data, resume: bo
         loss.network_params.data.update_(loss.target_network_params.data)
     share_weights(policies, trained)
     for name, parts in policies.items():
-        about = {"task": cfg["env"]["name"], "maze": cfg["env"]["maze"], "seed": cfg["seed"]}
+        about = {"task": cfg["env"]["name"], "env": cfg["env"], "seed": cfg["seed"]}
         save_policy(
             run.path / "policies" / name,
             parts.policy,
@@ -156,7 +156,7 @@ def main_run(run: RunFolder, cfg: dict[str, Any], resume: bool) -> None:
     titles = {name: f"{name}: {rows[name]['score']:.0f}" for name in rows}
     plain = {name: parts.policy for name, parts in policies.items()}
     plot_targets(task, episodes, plain, titles, run.path / "targets.png")
-    print(f"\n{format_table(rows)}\n\n{score_source(task)}", flush=True)
+    print(f"\n{format_table(rows)}\n\n{task.score_source}", flush=True)
 
 
 @hydra.main(config_path="config", config_name="dl_rad", version_base="1.3")

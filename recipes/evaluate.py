@@ -16,16 +16,23 @@ import torch
 from tensordict.nn import TensorDictSequential
 from torchrl._utils import logger as torchrl_logger
 
-from torchrl_rad import ExpertDatabase, make_maze_env, maze_task, with_goals
-from torchrl_rad.checkpoint import CheckpointError, read_json
+from torchrl_rad import ExpertDatabase, make_maze_env, with_goals
+from torchrl_rad.checkpoint import CheckpointError
 from torchrl_rad.envs.maze import maze_cell
 from torchrl_rad.evaluation import episode_results
-from torchrl_rad.experiment import collect_episodes, make_data, make_database, policy_row
+from torchrl_rad.experiment import (
+    collect_episodes,
+    make_data,
+    make_database,
+    policy_row,
+    saved_maze,
+    saved_task,
+)
 from torchrl_rad.plots import plot_followed
 from torchrl_rad.policy import load_policy
 from torchrl_rad.precision import planning_dtype
 from torchrl_rad.provenance import write_provenance
-from torchrl_rad.results import format_table, score_source
+from torchrl_rad.results import format_table
 from torchrl_rad.runs import RunFolder
 
 torchrl_logger.setLevel(logging.WARNING)
@@ -87,13 +94,17 @@ def main() -> None:
     goals, count = arguments.goals or [None], arguments.episodes
     try:
         policy = load(arguments)
-        task = maze_task(read_json(f"{arguments.folder}/policy.json")["maze"])
+        needs_maze = arguments.goals or arguments.picture
+        task = (saved_maze if needs_maze else saved_task)(arguments.folder)
         if count < 1:
             raise ValueError(f"--episodes is {count}; at least one is needed.")
         if len(policy) == 1 and (arguments.csv or arguments.picture):
             raise ValueError(f"the policy in {arguments.folder} retrieves nothing to write down.")
-        cells = [goal for goal in goals for _ in range(count)]
-        env = make_maze_env(task, len(cells), goal_cell=cells, show_goal=bool(arguments.goals))
+        if arguments.goals:
+            cells = [goal for goal in goals for _ in range(count)]
+            env = make_maze_env(task, len(cells), goal_cell=cells, show_goal=True)
+        else:
+            env = task.make_env(count)
     except (CheckpointError, FileNotFoundError, KeyError, ValueError) as error:
         sys.exit(f"error: {error.args[0] if isinstance(error, KeyError) else error}")
     dtype = planning_dtype(arguments.precision)
@@ -101,7 +112,7 @@ def main() -> None:
     names = [task.name if goal is None else f"{task.name} {goal}" for goal in goals]
     parts = dict(zip(names, steps.split(count), strict=True))
     print(format_table({name: policy_row(task, policy, part) for name, part in parts.items()}))
-    print(f"\n{score_source(task)}")
+    print(f"\n{task.score_source}")
     if arguments.goals:
         print("these are of the task's own goal; plans were not ranked: the return model is of it")
     if arguments.csv:

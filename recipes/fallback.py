@@ -21,16 +21,15 @@ from torchrl_rad import (
     ExpertDatabase,
     RetrievalSampler,
     make_maze_env,
-    maze_task,
     reaches_goal,
     similarity_threshold,
 )
-from torchrl_rad.checkpoint import CheckpointError, read_json, write_json
+from torchrl_rad.checkpoint import CheckpointError, write_json
 from torchrl_rad.data import episode_lengths
 from torchrl_rad.envs import FixedGoalMaze
 from torchrl_rad.envs.maze import maze_cell
 from torchrl_rad.evaluation import episode_results, interval
-from torchrl_rad.experiment import collect_episodes, make_data
+from torchrl_rad.experiment import collect_episodes, make_data, saved_maze
 from torchrl_rad.policy import load_policy
 from torchrl_rad.precision import planning_dtype
 from torchrl_rad.runs import RunFolder, environment_facts
@@ -129,7 +128,7 @@ def main() -> None:
     torch.set_num_threads(arguments.threads)
     folder = Path(arguments.folder).absolute()
     try:
-        task = maze_task(read_json(folder / "policy.json")["maze"])
+        task = saved_maze(folder)
         _, data = make_data(RunFolder.open(folder.parents[1]).config())
         like = ExpertDatabase.loads(folder / "database", memmap=True)
         maze = FixedGoalMaze(task)

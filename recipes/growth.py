@@ -18,13 +18,13 @@ from tensordict.nn import TensorDictSequential
 from torchrl._utils import logger as torchrl_logger
 from torchrl.data import LazyTensorStorage
 
-from torchrl_rad import ExpertDatabase, RetrievalSampler, make_maze_env, maze_task, reaches_goal
+from torchrl_rad import ExpertDatabase, RetrievalSampler, make_maze_env, reaches_goal
 from torchrl_rad._files import staged_folder
 from torchrl_rad.checkpoint import CheckpointError, read_json, write_json
 from torchrl_rad.data import episode_lengths
 from torchrl_rad.data.experts import select_episodes
 from torchrl_rad.evaluation import episode_results, interval
-from torchrl_rad.experiment import collect_episodes, make_data
+from torchrl_rad.experiment import collect_episodes, make_data, saved_maze
 from torchrl_rad.plots import plot_growth
 from torchrl_rad.policy import load_policy
 from torchrl_rad.precision import planning_dtype
@@ -169,7 +169,7 @@ def main() -> None:
     torch.set_num_threads(arguments.threads)
     folder, out = Path(arguments.folder).absolute(), Path(arguments.out)
     try:
-        task = maze_task(read_json(folder / "policy.json")["maze"])
+        task = saved_maze(folder)
         prepared = prepare(arguments, folder)
     except (CheckpointError, OSError, KeyError, ValueError) as error:
         sys.exit(f"error: {error.args[0] if isinstance(error, KeyError) else error}")

@@ -12,7 +12,6 @@ from scipy import stats
 from torchrl_rad.checkpoint import CheckpointError
 from torchrl_rad.results import (
     COLUMNS,
-    SCORE_SOURCE,
     format_table,
     merge_results,
     write_results,
@@ -86,11 +85,6 @@ def test_columns_come_in_order_whatever_the_order_of_the_figures():
 def test_figures_that_are_no_column_are_left_out():
     table = format_table({"a": {"score": 1.0, "episode_returns": [1.0], "latency_ms": {}}})
     assert table.splitlines()[0] == "| policy | score |"
-
-
-def test_score_source_names_d4rl():
-    text = SCORE_SOURCE.format(low=23.85, high=161.86)
-    assert "reference returns 23.85 and 161.86 of D4RL's maze2d v1 (d4rl/infos.py)" in text
 
 
 # several runs

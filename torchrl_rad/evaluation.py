@@ -153,17 +153,21 @@ def interval(values: Sequence[float] | np.ndarray, level: float = 0.95) -> tuple
 
 
 def summarise(
-    results: dict[str, np.ndarray], score: Callable[[np.ndarray], np.ndarray]
+    results: dict[str, np.ndarray],
+    score: Callable[[np.ndarray], np.ndarray],
+    names: Sequence[str] = ("success", "arrival", "share"),
 ) -> dict[str, float]:
     """Figures of a table row: means over episodes, the score with its 95 % interval.
 
     Args:
         results (dict): of :func:`episode_results`.
         score (callable): return -> normalised score.
+        names (sequence of str, optional): further figures; those of retrieval come where there are
+            any. Defaults to those of mazes.
     """
     mean, half = interval(score(results["return"]))
     figures = {"return": float(results["return"].mean()), "score": mean, "interval": half}
-    for key in ("success", "arrival", "share", "found", "similarity"):
+    for key in (*names, "found", "similarity"):
         if key in results:
             figures[key] = interval(results[key])[0]
     return {**figures, "episodes": len(results["return"])}

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictSequential
@@ -15,18 +15,22 @@ from torchrl.envs import EnvBase
 from torchrl.record.loggers import get_logger
 from tqdm import tqdm
 
+from torchrl_rad.checkpoint import read_json
 from torchrl_rad.data.database import ExpertDatabase
 from torchrl_rad.data.episodes import episode_lengths, return_to_go
 from torchrl_rad.data.experts import expert_from_config
 from torchrl_rad.data.maze2d import maze_dataset
 from torchrl_rad.data.report import DataReport, report
+from torchrl_rad.data.sources import load_dataset
 from torchrl_rad.data.windows import window_buffer
-from torchrl_rad.envs.maze import FixedGoalMaze, MazeTask, make_maze_env, maze_task
+from torchrl_rad.envs.maze import MazeTask
+from torchrl_rad.envs.task import Task
+from torchrl_rad.envs.tasks import make_task
 from torchrl_rad.evaluation import episode_results, evaluate, measure_latency, summarise
 from torchrl_rad.objectives.step import draw_step_pairs
 from torchrl_rad.policy import build_policy, fit_scales
 from torchrl_rad.precision import planning_dtype
-from torchrl_rad.results import score_source, write_results
+from torchrl_rad.results import write_results
 from torchrl_rad.retrieval import RetrievalSampler
 from torchrl_rad.runs import RunFolder, environment_facts
 
@@ -41,8 +45,11 @@ __all__ = [
     "make_logger",
     "make_policies",
     "policy_row",
+    "saved_maze",
+    "saved_task",
     "share_weights",
     "step_error",
+    "task_dataset",
     "window_sampler",
 ]
 
@@ -59,32 +66,36 @@ class PolicyParts:
     database: ExpertDatabase | None = None
 
 
-def make_data(cfg: Mapping[str, Any]) -> tuple[MazeTask, TensorDictBase]:
+def make_data(cfg: Mapping[str, Any]) -> tuple[Task, TensorDictBase]:
     """The task and its recorded steps [T], with ``return_to_go`` at the discount of L_g."""
-    task, source = maze_task(cfg["env"]["maze"]), cfg["replay_buffer"]
-    data = maze_dataset(
-        task,
-        source["dataset"],
-        source["steps"],
-        source["seed"],
-        source["download"],
-        cfg["logger"]["progress"],
-    ).copy()
+    task = make_task(cfg["env"])
+    data = task_dataset(task, cfg["replay_buffer"], cfg["logger"]["progress"]).copy()
     value = return_to_go(data["next", "reward"], episode_lengths(data), cfg["loss"]["gamma"])
     data["return_to_go"] = value
     return task, data
 
 
-def check_data(task: MazeTask, data: TensorDictBase) -> DataReport:
-    """A report on the data against the task's start cells.
+def task_dataset(task: Task, source: Mapping[str, Any], progress: bool = True) -> TensorDictBase:
+    """Recorded steps [T] with the rewards of a task.
+
+    Args:
+        task (Task): whose rewards they get.
+        source (mapping): ``dataset``, ``download`` and, of a collection, ``steps`` and ``seed``.
+        progress (bool, optional): show a progress bar. Defaults to ``True``.
+    """
+    if isinstance(task, MazeTask):
+        names = ("dataset", "steps", "seed", "download")
+        return maze_dataset(task, *(source[name] for name in names), progress)
+    return task.label(load_dataset(source["dataset"], task.adapter, source["download"], progress))
+
+
+def check_data(task: Task, data: TensorDictBase) -> DataReport:
+    """A report on the data against the task's starts.
 
     Raises:
         ValueError: it has faults; the message names them.
     """
-    env = FixedGoalMaze(task)
-    centres = np.stack([env.maze.cell_rowcol_to_xy(cell) for cell in env.reset_cells])
-    env.close()
-    found = report(data, starts=torch.from_numpy(centres).float())
+    found = report(data, starts=task.starts())
     if not found.ok:
         raise ValueError(f"the data cannot be trained on:\n{found}")
     return found
@@ -128,7 +139,11 @@ def make_policies(
     """
     planner = dict(network)
     reach, width = planner.pop("step_horizon"), planner.pop("step_width")
-    sizes = {"state_dim": data["observation"].shape[-1], "action_dim": data["action"].shape[-1]}
+    sizes = {
+        "state_dim": data["observation"].shape[-1],
+        "action_dim": data["action"].shape[-1],
+        "action_bound": float(data["action"].abs().max()),  # beyond, nobody knows what happens
+    }
     shared = {**sizes, "planner": planner}
     policies = {BACKBONE: PolicyParts(build_policy(shared), shared)}
     for name, options in retrieval.items():
@@ -181,6 +196,30 @@ def step_error(policy: TensorDictSequential, windows: TensorDictBase) -> float:
     return float((steps - pairs["target_step"]).abs().float().mean())
 
 
+def saved_task(folder: str | Path) -> Task:
+    """The task of a saved policy.
+
+    Raises:
+        FileNotFoundError: the folder holds no policy.
+    """
+    return make_task(read_json(Path(folder) / "policy.json")["env"])
+
+
+def saved_maze(folder: str | Path) -> MazeTask:
+    """The task of a saved policy, which must be a PointMaze.
+
+    Raises:
+        FileNotFoundError: the folder holds no policy.
+        ValueError: it is of another task.
+    """
+    task = saved_task(folder)
+    if not isinstance(task, MazeTask):
+        raise ValueError(
+            f"the policy in {folder} is of {task.name}; this needs one of a PointMaze."
+        )
+    return task
+
+
 def collect_episodes(
     env: EnvBase,
     policy: TensorDictSequential,
@@ -193,7 +232,7 @@ def collect_episodes(
     """The first episode of each row of an environment; same seed, same episodes.
 
     Args:
-        env (EnvBase): [n] rows, as of :func:`~torchrl_rad.envs.make_maze_env`.
+        env (EnvBase): [n] rows, as of :meth:`~torchrl_rad.envs.Task.make_env`.
         policy (TensorDictSequential): what acts.
         max_steps (int): limit of an episode.
         seed (int): of the start states and of the policy's noise.
@@ -209,7 +248,7 @@ def collect_episodes(
 
     def act(tensordict: TensorDictBase) -> TensorDictBase:
         with torch.autocast(device.type, dtype, dtype is not None):
-            return policy(tensordict.to(device)).to("cpu")  # where the mazes are
+            return policy(tensordict.to(device)).to("cpu")  # where the simulator is
 
     env.set_seed(seed)
     torch.manual_seed(seed)
@@ -251,7 +290,7 @@ def make_logger(run: RunFolder, cfg: Mapping[str, Any]) -> Callable[[int, dict[s
 def evaluate_policies(
     run: RunFolder,
     cfg: Mapping[str, Any],
-    task: MazeTask,
+    task: Task,
     policies: Mapping[str, PolicyParts],
     data: TensorDictBase,
 ) -> tuple[dict[str, dict[str, Any]], dict[str, TensorDictBase]]:
@@ -270,7 +309,7 @@ def evaluate_policies(
         steps = run.load_episodes(name)
         if steps is None:
             seed = settings["seed"] + cfg["seed"]
-            env = make_maze_env(task, settings["episodes"]) if env is None else env
+            env = task.make_env(settings["episodes"]) if env is None else env
             dtype = planning_dtype(cfg["optim"]["precision"], cfg["device"])
             steps = collect_episodes(
                 env, parts.policy, task.max_steps, seed, name, dtype, progress=progress
@@ -287,18 +326,15 @@ def evaluate_policies(
         env.close()  # TorchRL then raises the number of threads
         torch.set_num_threads(threads)
     about = {"task": cfg["env"]["name"], "seed": cfg["seed"], "data": cfg["replay_buffer"]}
-    source = score_source(task)
-    facts = environment_facts()
-    write_results(run.path, {**about, "rows": rows, "score_source": source, **facts})
+    facts = {"score_source": task.score_source, **environment_facts()}
+    write_results(run.path, {**about, "rows": rows, **facts})
     return rows, episodes
 
 
-def policy_row(
-    task: MazeTask, policy: TensorDictSequential, steps: TensorDictBase
-) -> dict[str, Any]:
+def policy_row(task: Task, policy: TensorDictSequential, steps: TensorDictBase) -> dict[str, Any]:
     """The figures of one policy: means, each episode's return, and latencies on one thread."""
     results = episode_results(steps)
-    row: dict[str, Any] = summarise(results, task.normalised_score)
+    row: dict[str, Any] = summarise(results, task.normalised_score, task.figures)
     row["episode_returns"] = results["return"].tolist()
     row["episode_scores"] = task.normalised_score(results["return"]).tolist()
     threads = torch.get_num_threads()

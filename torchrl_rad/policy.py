@@ -42,10 +42,11 @@ def build_policy(
     """A policy with fresh weights: TS, SE and PL, or PL alone where there is no ``"target"``.
 
     Args:
-        description (dict): ``state_dim``, ``action_dim``; ``planner``, ``estimator`` and
-            ``target``: arguments of :class:`DiffuserLitePlanner`, :class:`StepEstimator` and
-            :class:`RetrievalTargetModule`. The horizon of ``"target"`` holds for the estimator too;
-            it is the planner's if it is left out.
+        description (dict): ``state_dim``, ``action_dim`` and ``action_bound`` (1.0 if left out);
+            ``planner``, ``estimator`` and ``target``: arguments of :class:`DiffuserLitePlanner`,
+            :class:`StepEstimator` and :class:`RetrievalTargetModule`, a ``goal_reward`` as those of
+            :class:`GoalReward`. The horizon of ``"target"`` holds for the estimator too; it is the
+            planner's if it is left out.
         database (ExpertDatabase, optional): the demonstrations, needed with a target.
 
     Raises:
@@ -75,7 +76,8 @@ def build_policy(
             "leave it out, so that the target's holds."
         )
     states, difference = Normalizer.identity(width), Normalizer.identity(width)
-    inverse = InverseDynamics(states, difference, description["action_dim"])
+    bound = description.get("action_bound", 1.0)
+    inverse = InverseDynamics(states, difference, description["action_dim"], bound=bound)
     if planner_options["candidates"] > 1:
         tokens = (horizon - 1) // planner_options["jumps"][0] + 1
         planner_options["return_model"] = ReturnModel(states, tokens)
@@ -86,11 +88,11 @@ def build_policy(
         return TensorDictSequential(planner)
     if database is None:
         raise ValueError("this policy retrieves targets: pass the database.")
-    select = RetrievalTargetModule(
-        database,
-        out_keys=[*OUT_KEYS, "target_offset", "target_source"],
-        **{**target, "horizon": reach},
-    )
+    options = {**target, "horizon": reach}
+    if "goal_reward" in options:
+        options["goal_reward"] = GoalReward(**options["goal_reward"])
+    names = [*OUT_KEYS, "target_offset", "target_source"]
+    select = RetrievalTargetModule(database, out_keys=names, **options)
     estimator = StepEstimator(states, **{**estimator_options, "horizon": reach})
     return TensorDictSequential(select, estimator, planner)
 

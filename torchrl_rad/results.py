@@ -9,19 +9,18 @@ from typing import Any
 import numpy as np
 
 from torchrl_rad._files import CheckpointError, read_json, write_json
-from torchrl_rad.envs.maze import MazeTask
 from torchrl_rad.evaluation import interval
 
-__all__ = ["SCORE_SOURCE", "format_table", "merge_results", "score_source", "write_results"]
+__all__ = ["format_table", "merge_results", "write_results"]
 
-SCORE_SOURCE = (
-    "score: 100 x (return - min) / (max - min), reference returns {low} and {high} of D4RL's "
-    "maze2d v1 (d4rl/infos.py)"
-)
+MEANS = (
+    "return", "length", "success", "arrival", "share", "found", "similarity", "step_error",
+)  # fmt: skip
 COLUMNS = {  # key: (heading, format)
     "return": ("return", "{:.1f}"),
     "score": ("score", "{:.1f}"),
     "interval": ("+- 95 %", "{:.1f}"),
+    "length": ("steps", "{:.0f}"),
     "success": ("success", "{:.2f}"),
     "arrival": ("steps to goal", "{:.0f}"),
     "share": ("share at goal", "{:.3f}"),
@@ -34,12 +33,6 @@ COLUMNS = {  # key: (heading, format)
     "PL": ("PL ms", "{}"),
     "seeds": ("score of each seed", "{}"),
 }
-
-
-def score_source(task: MazeTask) -> str:
-    """The line under a table: how the scores of a task are normalised, and by whose returns."""
-    low, high = task.reference_scores
-    return SCORE_SOURCE.format(low=low, high=high)
 
 
 def format_table(rows: Mapping[str, Mapping[str, Any]]) -> str:
@@ -133,7 +126,7 @@ def _merge(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     pooled = np.concatenate([row["episode_scores"] for row in rows])
     merged = {
         key: interval([row[key] for row in rows])[0]  # None is NaN there
-        for key in ("return", "success", "arrival", "share", "found", "similarity", "step_error")
+        for key in MEANS
         if all(key in row for row in rows)
     }
     between = interval(scores)[1] if len(scores) > 1 else 0.0

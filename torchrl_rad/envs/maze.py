@@ -17,6 +17,7 @@ from torchrl.envs import DoubleToFloat, GymWrapper, SerialEnv, TransformedEnv
 from torchrl.envs.transforms import Compose, InitTracker
 
 from torchrl_rad.envs.adapter import ObservationAdapter
+from torchrl_rad.envs.task import Task
 from torchrl_rad.retrieval.goals import GoalReward
 
 __all__ = ["MAZES", "FixedGoalMaze", "MazeTask", "make_maze_env", "maze_task", "relabel_goal"]
@@ -26,8 +27,10 @@ RESET_NOISE = 0.1  # D4RL's start noise in cells; gymnasium-robotics' own is 0.2
 
 
 @dataclass(frozen=True)
-class MazeTask:
+class MazeTask(Task):
     """What the D4RL Maze2D protocol fixes for one maze.
+
+    ``starts`` of :meth:`make_env` are cells (row, column), which rows take in turn.
 
     Attributes:
         name: name of the task.
@@ -47,10 +50,17 @@ class MazeTask:
     reference_scores: tuple[float, float]
     expert_steps: tuple[int, int]
 
-    def normalised_score(self, episode_return: float | np.ndarray) -> Any:
-        """Return of an episode on D4RL's scale: 0 is its random policy, 100 its controller."""
-        low, high = self.reference_scores
-        return 100.0 * (episode_return - low) / (high - low)
+    reference = "D4RL's maze2d v1 (d4rl/infos.py)"
+
+    def make_row(self, number: int, starts: Sequence[tuple[int, int]] | None = None) -> gym.Env:
+        return FixedGoalMaze(self, None, None if starts is None else starts[number % len(starts)])
+
+    def starts(self) -> Tensor:
+        env = FixedGoalMaze(self)
+        env.close()
+        return torch.tensor(
+            np.stack([env.maze.cell_rowcol_to_xy(cell) for cell in env.reset_cells])
+        ).float()
 
 
 MAZES = {
@@ -111,16 +121,13 @@ class FixedGoalMaze(gym.Wrapper):
         robot: Any = self.unwrapped
         robot.position_noise_range = RESET_NOISE
         self.maze = robot.maze
-        self.goal_cell = _cell("goal_cell", task.goal_cell if goal_cell is None else goal_cell)
+        goal = task.goal_cell if goal_cell is None else goal_cell
+        (self.goal_cell,) = maze_cells(task.env_id, self.maze.maze_map, goal_cell=goal)
         self.free_cells = free_cells(self.maze.maze_map)
         self.reset_cells = self.free_cells
         if reset_cell is not None:
-            self.reset_cells = _cell("reset_cell", reset_cell)[None]
-        for cell in (self.goal_cell, *self.reset_cells):
-            if not (self.free_cells == cell).all(-1).any():
-                raise ValueError(
-                    f"cell {tuple(cell.tolist())} of {task.env_id} is a wall or outside the map."
-                )
+            given = maze_cells(task.env_id, self.maze.maze_map, reset_cell=reset_cell)
+            self.reset_cells = np.stack(given)
         self.goal = self.maze.cell_rowcol_to_xy(self.goal_cell)
         self.show_goal = show_goal
         state = gym.spaces.Box(-np.inf, np.inf, (4,), np.float32)
@@ -148,11 +155,23 @@ class FixedGoalMaze(gym.Wrapper):
         return {"observation": state, "goal": self.goal.astype(np.float32)}
 
 
-def _cell(name: str, value: Any) -> np.ndarray:
-    cell = np.asarray(value)
-    if cell.shape != (2,) or cell.dtype.kind not in "iu":
-        raise ValueError(f"{name} is {value}; expected (row, column), two whole numbers.")
-    return cell
+def maze_cells(env_id: str, maze_map: list[list[Any]], **cells: Any) -> list[np.ndarray]:
+    """Named cells of a map as arrays [2].
+
+    Raises:
+        ValueError: one is no (row, column), a wall, or outside the map.
+    """
+    free, found = free_cells(maze_map), []
+    for name, value in cells.items():
+        cell = np.asarray(value)
+        if cell.shape != (2,) or cell.dtype.kind not in "iu":
+            raise ValueError(f"{name} is {value}; expected (row, column), two whole numbers.")
+        if not (free == cell).all(-1).any():
+            raise ValueError(
+                f"cell {tuple(cell.tolist())} of {env_id} is a wall or outside the map."
+            )
+        found.append(cell)
+    return found
 
 
 def maze_cell(text: str) -> tuple[int, int]:
