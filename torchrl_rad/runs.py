@@ -81,6 +81,7 @@ class RunFolder:
     ``config.json``             the resolved config
     ``metrics.csv``             losses and errors while training
     ``checkpoints/``            see :class:`~torchrl_rad.checkpoint.Checkpointer`
+    ``value/``, ``value.csv``   the same of a learned value, where there is one
     ``policies/<name>/``        see :func:`~torchrl_rad.policy.save_policy`
     ``episodes/<name>``         every episode of the evaluation, safetensors
     ``results.json``            each figure of the table and each episode's return
@@ -101,6 +102,7 @@ class RunFolder:
     def __init__(self, path: str | Path):
         self.path = Path(path).absolute()
         self.metrics = MetricsLog(self.path / "metrics.csv")
+        self.value_metrics = MetricsLog(self.path / "value.csv")
 
     @classmethod
     def create(cls, path: str | Path, config: Mapping[str, Any]) -> RunFolder:
