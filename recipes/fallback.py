@@ -26,6 +26,8 @@ from torchrl_rad import (
 )
 from torchrl_rad.checkpoint import CheckpointError, write_json
 from torchrl_rad.data import episode_lengths
+from torchrl_rad.data.experts import select_episodes
+from torchrl_rad.data.regions import enters_region
 from torchrl_rad.envs import FixedGoalMaze
 from torchrl_rad.envs.maze import maze_cell
 from torchrl_rad.evaluation import episode_results, interval
@@ -58,16 +60,12 @@ def parse() -> argparse.Namespace:
 def demonstrations(data: TensorDictBase, maze: Any, without: list[tuple[int, int]]):
     """Steps of the recorded episodes that reach the goal and do not enter some cells."""
     centres = torch.tensor(np.stack([maze.cell_rowcol_to_xy(np.array(cell)) for cell in without]))
-    offset = data["observation"][:, None, :2] - centres
-    inside = (offset.abs() <= 0.5).all(-1).any(-1)  # [T]
+    gone = enters_region(data, centres, 0.5)
     lengths = episode_lengths(data)
-    episode = torch.repeat_interleave(torch.arange(len(lengths)), lengths)
-    kept = torch.zeros(len(lengths), dtype=torch.bool)
-    kept[episode[data["next", "reward"][:, 0] > 0]] = True
-    kept[episode[inside]] = False
-    if not kept.any():
+    reaches = select_episodes(reaches_goal(), data.split(lengths.tolist()))
+    if not (reaches & ~gone).any():
         raise ValueError("no demonstration is left that enters none of these cells.")
-    return data[kept[episode]].exclude("return_to_go")
+    return data[torch.repeat_interleave(reaches & ~gone, lengths)].exclude("return_to_go")
 
 
 def database_of(steps: TensorDictBase, like: ExpertDatabase, threshold: float) -> ExpertDatabase:

@@ -85,7 +85,7 @@ def task_dataset(task: Task, source: Mapping[str, Any], progress: bool = True) -
     """
     if isinstance(task, MazeTask):
         names = ("dataset", "steps", "seed", "download")
-        return maze_dataset(task, *(source[name] for name in names), progress)
+        return maze_dataset(task, **{name: source[name] for name in names}, progress=progress)
     return task.label(load_dataset(source["dataset"], task.adapter, source["download"], progress))
 
 

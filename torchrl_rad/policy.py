@@ -8,7 +8,7 @@ from typing import Any
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictSequential
+from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 from tensordict.utils import NestedKey
 
 from torchrl_rad.checkpoint import (
@@ -28,6 +28,7 @@ from torchrl_rad.modules.normalizer import Normalizer
 from torchrl_rad.modules.return_model import ReturnModel
 from torchrl_rad.modules.step import StepEstimator
 from torchrl_rad.modules.target import OUT_KEYS, RetrievalTargetModule
+from torchrl_rad.modules.target_variants import PlainTargetModule
 from torchrl_rad.retrieval.goals import GoalReward
 
 __all__ = ["build_policy", "fit_scales", "load_policy", "save_policy", "with_goals"]
@@ -45,8 +46,9 @@ def build_policy(
         description (dict): ``state_dim``, ``action_dim`` and ``action_bound`` (1.0 if left out);
             ``planner``, ``estimator`` and ``target``: arguments of :class:`DiffuserLitePlanner`,
             :class:`StepEstimator` and :class:`RetrievalTargetModule`, a ``goal_reward`` as those of
-            :class:`GoalReward`. The horizon of ``"target"`` holds for the estimator too; it is the
-            planner's if it is left out.
+            :class:`GoalReward`; the rules ``"random"``, ``"nearest"`` and ``"none"`` are those of
+            :class:`PlainTargetModule`. The horizon of ``"target"`` holds for the estimator too; it
+            is the planner's if it is left out.
         database (ExpertDatabase, optional): the demonstrations, needed with a target.
 
     Raises:
@@ -88,13 +90,18 @@ def build_policy(
         return TensorDictSequential(planner)
     if database is None:
         raise ValueError("this policy retrieves targets: pass the database.")
-    options = {**target, "horizon": reach}
-    if "goal_reward" in options:
-        options["goal_reward"] = GoalReward(**options["goal_reward"])
-    names = [*OUT_KEYS, "target_offset", "target_source"]
-    select = RetrievalTargetModule(database, out_keys=names, **options)
+    select = _select(database, {**target, "horizon": reach})
     estimator = StepEstimator(states, **{**estimator_options, "horizon": reach})
     return TensorDictSequential(select, estimator, planner)
+
+
+def _select(database: ExpertDatabase, options: dict[str, Any]) -> TensorDictModuleBase:
+    names = (*OUT_KEYS, "target_offset", "target_source")
+    if options.get("rule") in ("random", "nearest", "none"):
+        return PlainTargetModule(database, options["rule"], out_keys=names)
+    if "goal_reward" in options:
+        options["goal_reward"] = GoalReward(**options["goal_reward"])
+    return RetrievalTargetModule(database, out_keys=names, **options)
 
 
 def with_goals(

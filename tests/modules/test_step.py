@@ -106,6 +106,15 @@ def test_recorded_without_an_offset():
         fixed([0.0] * 8, estimate="recorded")(pairs(4))
 
 
+def test_random_steps_are_uniform():
+    estimator = StepEstimator(Normalizer.identity(2), horizon=9, estimate="random")
+    torch.manual_seed(0)
+    steps = estimator(TensorDict({name: torch.zeros(8000, 2) for name in ("observation", "target")},
+                                 [8000]))["target_step"]  # fmt: skip
+    count = steps[:, 0].bincount(minlength=9)
+    assert len(count) == 9 and count[0] == 0 and (count[1:] - 1000).abs().max() < 150
+
+
 def test_logits_on_demand():
     keys = ["target_step", "step_logits"]
     td = fixed([0.0, 1.0, 2.0], out_keys=keys)(pairs(2, 3))

@@ -138,6 +138,20 @@ def test_share_without_a_target(share):
             assert not pinned.any()
 
 
+def test_pseudo_targets_at_one_step():
+    loss = make(no_target=0.0, pseudo_step=6)
+    _, mask = loss.pieces(0, torch.randn(300, HORIZON, DIM))
+    assert mask.squeeze(-1).tolist() == [[True, False, True, False, False]] * 300
+    _, mask = loss.pieces(1, torch.randn(300, HORIZON, DIM))  # three steps long: at its end
+    assert mask.squeeze(-1).tolist() == [[True, False, False, True]] * 300
+
+
+@pytest.mark.parametrize("step", [0, HORIZON])
+def test_bad_pseudo_step(step):
+    with pytest.raises(ValueError, match=f"pseudo_step is {step}; expected 1 to 12, or None"):
+        make(pseudo_step=step)
+
+
 def test_planner_without_targets_is_trained_without():
     loss = make(targets=False, no_target=0.0)
     _, mask = loss.pieces(0, torch.randn(300, HORIZON, DIM))

@@ -13,6 +13,7 @@ from torchrl_rad.data.experts import (
 )
 from torchrl_rad.data.minari import check_content, join_stream, load_minari
 from torchrl_rad.data.pointmaze import collect_pointmaze, pointmaze_dataset
+from torchrl_rad.data.regions import enters_region, without_region
 from torchrl_rad.data.report import DataReport
 from torchrl_rad.data.report import report as data_report  # "report" is the module
 from torchrl_rad.data.windows import Window, WindowSampler, window_buffer
@@ -26,6 +27,7 @@ __all__ = [
     "check_content",
     "collect_pointmaze",
     "data_report",
+    "enters_region",
     "episode_length",
     "episode_lengths",
     "expert_from_config",
@@ -39,4 +41,5 @@ __all__ = [
     "subtasks_done",
     "top_share_by_return",
     "window_buffer",
+    "without_region",
 ]

@@ -121,8 +121,8 @@ class FixedGoalMaze(gym.Wrapper):
         robot: Any = self.unwrapped
         robot.position_noise_range = RESET_NOISE
         self.maze = robot.maze
-        goal = task.goal_cell if goal_cell is None else goal_cell
-        (self.goal_cell,) = maze_cells(task.env_id, self.maze.maze_map, goal_cell=goal)
+        cell = task.goal_cell if goal_cell is None else goal_cell
+        (self.goal_cell,) = maze_cells(task.env_id, self.maze.maze_map, goal_cell=cell)
         self.free_cells = free_cells(self.maze.maze_map)
         self.reset_cells = self.free_cells
         if reset_cell is not None:

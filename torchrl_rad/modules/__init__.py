@@ -11,6 +11,7 @@ from torchrl_rad.modules.return_model import ReturnModel
 from torchrl_rad.modules.sampling import sample_plan
 from torchrl_rad.modules.step import StepEstimator
 from torchrl_rad.modules.target import RetrievalTargetModule
+from torchrl_rad.modules.target_variants import PlainTargetModule
 
 __all__ = [
     "DiT",
@@ -18,6 +19,7 @@ __all__ = [
     "DiffuserLitePlanner",
     "InverseDynamics",
     "Normalizer",
+    "PlainTargetModule",
     "RectifiedFlow",
     "RetrievalTargetModule",
     "ReturnModel",

@@ -16,6 +16,8 @@ from torchrl_rad.modules.normalizer import Normalizer
 
 __all__ = ["StepEstimator"]
 
+ESTIMATES = ("mode", "median", "mean", "recorded", "random")
+
 
 class StepEstimator(TensorDictModuleBase):
     """Estimates the steps from a state to a target, 1 to H - 1.
@@ -42,8 +44,9 @@ class StepEstimator(TensorDictModuleBase):
         width (int, optional): Defaults to ``256``.
         activation (str, optional): ``"softmax"``: classes exclude each other; ``"sigmoid"``: one
             against the rest, as the paper prints it. Defaults to ``"softmax"``.
-        estimate (str, optional): ``"mode"``, ``"median"`` or ``"mean"`` of the classes, or
-            ``"recorded"``. Defaults to ``"mode"``.
+        estimate (str, optional): ``"mode"``, ``"median"`` or ``"mean"`` of the classes;
+            ``"recorded"``; or ``"random"``, uniform over the steps, for the ablation -SE. Defaults
+            to ``"mode"``.
         pace (float, optional): the steps are multiplied by it and rounded, 1 at least. Below 1 it
             asks the planner to arrive sooner than the demonstrations did. Defaults to ``1.0``.
         in_keys (sequence of NestedKey, optional): state and target, and the offset if
@@ -68,7 +71,7 @@ class StepEstimator(TensorDictModuleBase):
         horizon: int,
         width: int = 256,
         activation: Literal["softmax", "sigmoid"] = "softmax",
-        estimate: Literal["mode", "median", "mean", "recorded"] = "mode",
+        estimate: Literal["mode", "median", "mean", "recorded", "random"] = "mode",
         pace: float = 1.0,
         in_keys: Sequence[NestedKey] | None = None,
         out_keys: Sequence[NestedKey] = ("target_step",),
@@ -80,10 +83,8 @@ class StepEstimator(TensorDictModuleBase):
             raise ValueError(f"horizon is {horizon}; a step estimate needs 2 or more.")
         if activation not in ("softmax", "sigmoid"):
             raise ValueError(f"activation is {activation!r}; expected 'softmax' or 'sigmoid'.")
-        if estimate not in ("mode", "median", "mean", "recorded"):
-            raise ValueError(
-                f"estimate is {estimate!r}; expected 'mode', 'median', 'mean' or 'recorded'."
-            )
+        if estimate not in ESTIMATES:
+            raise ValueError(f"estimate is {estimate!r}; expected one of {list(ESTIMATES)}.")
         if in_keys is None:
             in_keys = ["observation", "target"] + ["target_offset"] * (estimate == "recorded")
         self.in_keys, self.out_keys = list(in_keys), list(out_keys)
@@ -131,6 +132,9 @@ class StepEstimator(TensorDictModuleBase):
         return steps.clamp(1, self.horizon - 1)
 
     def _steps(self, logits: Tensor) -> Tensor:
+        if self.estimate == "random":
+            shape = (*logits.shape[:-1], 1)
+            return torch.randint(1, self.horizon, shape, device=logits.device)
         if self.estimate in ("mode", "recorded"):
             return logits.argmax(-1, keepdim=True) + 1
         # sigmoids divided by their sum, also where all of them underflow

@@ -39,6 +39,8 @@ class DenoisingLoss(KeyedLoss):
     Keyword Args:
         no_target (float, optional): share of pieces without a target; a planner with
             ``targets=False`` has none at all. Defaults to ``0.2``.
+        pseudo_step (int, optional): the same step for every pseudo target, for the ablation -PTS.
+            Defaults to a random one.
         next_weight (float, optional): weight of grid point 1. Defaults to ``10.0``
             (DiffuserLite's).
         delay (bool, optional): keep target parameters, for :class:`torchrl.objectives.SoftUpdate`.
@@ -82,6 +84,7 @@ class DenoisingLoss(KeyedLoss):
         planner: DiffuserLitePlanner,
         *,
         no_target: float = 0.2,
+        pseudo_step: int | None = None,
         next_weight: float = 10.0,
         delay: bool = False,
         reduction: Literal["none", "mean", "sum"] | None = None,
@@ -89,13 +92,17 @@ class DenoisingLoss(KeyedLoss):
         super().__init__()
         if not 0.0 <= no_target <= 1.0:
             raise ValueError(f"no_target is {no_target}; expected a share in [0, 1].")
+        if pseudo_step is not None and not 1 <= pseudo_step < planner.horizon:
+            raise ValueError(
+                f"pseudo_step is {pseudo_step}; expected 1 to {planner.horizon - 1}, or None."
+            )
         self.convert_to_functional(planner.networks, "network", create_target_params=delay)
         self.planner_normalizer = planner.normalizer
         self.levels, self.horizon = planner.levels, planner.horizon
         self.process, self.placement = planner.process, planner.placement
         self._out_keys = ["loss_denoising", *(f"level_{n}" for n in range(len(self.levels)))]
         self.no_target = no_target if planner.targets else 1.0
-        self.next_weight = next_weight
+        self.pseudo_step, self.next_weight = pseudo_step, next_weight
         self.reduction = "mean" if reduction is None else reduction
 
     @property
@@ -162,6 +169,8 @@ class DenoisingLoss(KeyedLoss):
         mask[:, 0] = True
         mask[:, -1] = number > 0
         step = torch.randint(1, level.span + 1, (count,), device=device)
+        if self.pseudo_step is not None:  # on levels that do not reach so far, at their end
+            step = torch.full_like(step, min(self.pseudo_step, level.span))
         place = self.placement(step, number, *level)
         pinned = place.active & (torch.rand(count, device=device) >= self.no_target)
         # a shifted placement pins the window's own state; others move that at `step` to the grid
