@@ -11,7 +11,9 @@ from torchrl_rad.data.experts import (
     subtasks_done,
     top_share_by_return,
 )
+from torchrl_rad.data.hdf5 import has_successor, load_hdf5
 from torchrl_rad.data.minari import check_content, join_stream, load_minari
+from torchrl_rad.data.ogbench import load_ogbench
 from torchrl_rad.data.pointmaze import collect_pointmaze, pointmaze_dataset
 from torchrl_rad.data.regions import enters_region, without_region
 from torchrl_rad.data.report import DataReport
@@ -32,8 +34,11 @@ __all__ = [
     "episode_lengths",
     "expert_from_config",
     "first_hit_within",
+    "has_successor",
     "join_stream",
+    "load_hdf5",
     "load_minari",
+    "load_ogbench",
     "pointmaze_dataset",
     "reaches_goal",
     "return_to_go",
