@@ -6,6 +6,7 @@ import torch
 from tensordict import TensorDict
 from torchrl.envs.utils import check_env_specs
 
+from torchrl_rad import GoalReward
 from torchrl_rad.envs import FixedGoalMaze, make_maze_env, maze_task, relabel_goal
 from torchrl_rad.envs.maze import RESET_NOISE
 
@@ -184,6 +185,20 @@ def test_relabel_by_hand():
     assert far["next", "reward"].flatten().tolist() == [0, 0, 0, 1]
     assert (steps["next", "reward"] == 9).all()
     assert near["observation"] is steps["observation"]
+
+
+def test_relabel_with_another_radius_and_other_entries():
+    state = torch.tensor([[9.0, 0.0, 0.0], [9.0, 0.6, 0.8], [0.0, 9.0, 9.0]])
+    steps = TensorDict({"observation": state, "next": {"observation": state}}, [3])
+    reward = GoalReward(radius=1.0, dims=[1, 2])
+    assert relabel_goal(steps, [0.0, 0.0], reward)["next", "reward"].flatten().tolist() == [1, 1, 0]
+    with pytest.raises(ValueError, match="a goal has 3 entries"):
+        relabel_goal(steps, [0.0, 0.0, 0.0], reward)
+
+
+def test_relabel_of_a_batch_of_episodes():
+    steps = TensorDict({"next": {"observation": torch.zeros(2, 3, 4)}}, [2, 3])
+    assert relabel_goal(steps, [0.0, 0.0])["next", "reward"].shape == (2, 3, 1)
 
 
 def test_relabelled_rewards_are_those_of_the_environment():

@@ -3,10 +3,16 @@
 from __future__ import annotations
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-__all__ = ["episode_ids", "episode_lengths", "return_to_go", "step_and_remaining"]
+__all__ = [
+    "episode_ids",
+    "episode_lengths",
+    "return_to_go",
+    "step_and_remaining",
+    "with_reward",
+]
 
 
 def episode_lengths(steps: TensorDictBase) -> Tensor:
@@ -148,3 +154,18 @@ def return_to_go(reward: Tensor, lengths: Tensor, gamma: float) -> Tensor:
         value = padded[t] + gamma * value
         out[t] = value
     return out[step, column].float()
+
+
+def with_reward(steps: TensorDictBase, reward: Tensor) -> TensorDictBase:
+    """A shallow copy of steps [...] with other rewards [...], stored as [..., 1].
+
+    Examples:
+        >>> from tensordict import TensorDict
+        >>> steps = TensorDict({"next": {"reward": torch.zeros(2, 1)}}, [2])
+        >>> with_reward(steps, torch.ones(2))["next", "reward"].tolist()
+        [[1.0], [1.0]]
+    """
+    out = steps.copy()
+    columns = {**dict(steps["next"].items()), "reward": reward[..., None]}
+    out["next"] = TensorDict(columns, steps.batch_size)
+    return out

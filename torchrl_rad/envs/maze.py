@@ -11,11 +11,12 @@ import gymnasium as gym
 import gymnasium_robotics
 import numpy as np
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import DoubleToFloat, GymWrapper, SerialEnv, TransformedEnv
 from torchrl.envs.transforms import Compose, InitTracker
 
+from torchrl_rad.data.episodes import with_reward
 from torchrl_rad.envs.adapter import ObservationAdapter
 from torchrl_rad.envs.task import Task
 from torchrl_rad.retrieval.goals import GoalReward
@@ -195,31 +196,41 @@ def free_cells(maze_map: list[list[Any]]) -> np.ndarray:
     )
 
 
-def relabel_goal(episodes: TensorDictBase, goal: np.ndarray | Tensor) -> TensorDictBase:
-    """Gives recorded steps the reward of another goal: 1 where the next state is within 0.5 of it.
+def relabel_goal(
+    episodes: TensorDictBase, goal: np.ndarray | Tensor, goal_reward: GoalReward | None = None
+) -> TensorDictBase:
+    """Gives recorded steps the reward of a goal: 1 where the next state is within 0.5 of it.
+
+    D4RL labels its mazes so, Maze2D and AntMaze, against the goal of the evaluation. States of
+    AntMaze need x and y in front: Minari's sets have them in ``achieved_goal``, so that the adapter
+    is ``ObservationAdapter(("achieved_goal", "observation"))``.
 
     Args:
         episodes (TensorDictBase): flat steps with ``("next", "observation")``, whose first two
             entries are x, y.
         goal: x, y of the goal.
+        goal_reward (GoalReward, optional): another radius, or other entries of the state. Defaults
+            to within 0.5 in the first entries, as many as the goal has.
 
     Returns:
         A shallow copy with ``("next", "reward")`` [T, 1] float32 replaced.
 
+    Raises:
+        ValueError: the goal has another width than the entries of the state that it is compared to.
+
     Examples:
-        >>> import torch
+        >>> from tensordict import TensorDict
         >>> states = torch.tensor([[0.0, 0.4], [0.0, 0.6]])
         >>> steps = TensorDict({"next": {"observation": states}}, [2])
         >>> relabel_goal(steps, [0.0, 0.0])["next", "reward"].squeeze(-1).tolist()
         [1.0, 0.0]
+        >>> wide = GoalReward(radius=0.7)
+        >>> relabel_goal(steps, [0.0, 0.0], wide)["next", "reward"].squeeze(-1).tolist()
+        [1.0, 1.0]
     """
     goal = torch.as_tensor(np.asarray(goal), dtype=torch.float32)
-    reward = GoalReward(GOAL_RADIUS)(episodes["next", "observation"], goal).float()[..., None]
-    out = episodes.copy()
-    out["next"] = TensorDict(
-        {**dict(episodes["next"].items()), "reward": reward}, episodes.batch_size
-    )
-    return out
+    goal_reward = GoalReward(GOAL_RADIUS) if goal_reward is None else goal_reward
+    return with_reward(episodes, goal_reward(episodes["next", "observation"], goal).float())
 
 
 def make_maze_env(
