@@ -14,6 +14,7 @@ from torchrl_rad.data import (
     expert_from_config,
     first_hit_within,
     reaches_goal,
+    return_at_least,
     subtasks_done,
     top_share_by_return,
 )
@@ -55,6 +56,12 @@ def test_empty_range():
 def test_reaches_goal():
     assert reaches_goal()(episode(0, 0, 1)) is True
     assert reaches_goal()(episode(0, -1, 0)) is False
+
+
+def test_return_at_least():
+    assert return_at_least(3)(episode(1, 0, 1, 1)) is True
+    assert return_at_least(3)(episode(2, 0.9)) is False
+    assert expert_from_config(return_at_least(3).config)(episode(3)) is True
 
 
 def test_subtasks_done():

@@ -166,6 +166,24 @@ def test_discrete_actions_become_one_column():
     assert load("discrete-v0")["action"].tolist() == [[0.0], [2.0], [1.0]]
 
 
+def test_infos_of_the_rows_own_states():
+    episodes = pointmaze_stream([3, 2])
+    write("D4RL/pointmaze/umaze-v2", episodes, POINTMAZE)
+    td = load("D4RL/pointmaze/umaze-v2", infos=("qpos", "success"))
+    expected = np.concatenate([e.infos["qpos"][:-1] for e in episodes])
+    np.testing.assert_array_equal(td["info", "qpos"], np.float32(expected))
+    assert td["info", "success"].shape == (5, 1) and td["info", "success"].dtype == torch.float32
+    assert td["next"].keys() == load("D4RL/pointmaze/umaze-v2")["next"].keys()
+
+
+def test_other_rewards():
+    write("flat-v0", [flat_episode(3), flat_episode(2)])
+    td = load("flat-v0", reward=lambda observations: observations[1:, 0])
+    assert td["next", "reward"].flatten().tolist() == [2, 4, 6, 2, 4]
+    with pytest.raises(ValueError, match="episode 0: .* gave 4 rewards .*; expected 3"):
+        load("flat-v0", reward=lambda observations: observations[:, 0])
+
+
 def test_progress_bar_is_optional(capsys):
     write("flat-v0", [flat_episode()])
     load("flat-v0")
@@ -275,6 +293,35 @@ def test_entry_that_is_no_array():
     assert load("kitchen-v0")["observation"].shape == (3, 2)
     with pytest.raises(TypeError, match="cannot make one vector"):
         load("kitchen-v0", ObservationAdapter(("achieved_goal",)))
+
+
+def test_infos_that_lack_an_entry():
+    write("flat-v0", [flat_episode(infos={"qpos": np.ones((4, 2))})])
+    assert load("flat-v0", infos=("qpos",))["info", "qpos"].shape == (3, 2)
+    with pytest.raises(KeyError, match="episode 0: infos lack 'qvel'; there are .'qpos'."):
+        load("flat-v0", infos=("qvel",))
+    write("bare-v0", [flat_episode()])
+    with pytest.raises(KeyError, match="infos lack 'qvel'"):
+        load("bare-v0", infos=("qvel",))
+
+
+def test_infos_of_another_form():
+    tasks = {"kettle": np.ones((4, 1))}
+    write("dict-v0", [flat_episode(infos={"done": tasks, "ctrl": np.ones((3, 2))})])
+    with pytest.raises(TypeError, match="'done' of the infos is no array of numbers"):
+        load("dict-v0", infos=("done",))
+    with pytest.raises(
+        ValueError, match=r"'ctrl' of the infos has shape \[3, 2\], expected 4 rows"
+    ):
+        load("dict-v0", infos=("ctrl",))
+
+
+def test_infos_that_are_not_finite():
+    qpos = np.ones((4, 2))
+    qpos[1] = np.nan
+    write("nan-v0", [flat_episode(infos={"qpos": qpos})])
+    with pytest.raises(ValueError, match=r"\('info', 'qpos'\) at 1 row: episode 0 step 1"):
+        load("nan-v0", infos=("qpos",))
 
 
 def test_dict_actions():

@@ -8,10 +8,18 @@ from torchrl_rad.data.experts import (
     expert_from_config,
     first_hit_within,
     reaches_goal,
+    return_at_least,
     subtasks_done,
     top_share_by_return,
 )
 from torchrl_rad.data.hdf5 import has_successor, load_hdf5
+from torchrl_rad.data.kitchen import (
+    KITCHEN_TASKS,
+    newly_done,
+    relabel_tasks,
+    tasks_done,
+    tasks_in_place,
+)
 from torchrl_rad.data.minari import check_content, join_stream, load_minari
 from torchrl_rad.data.ogbench import load_ogbench
 from torchrl_rad.data.pointmaze import collect_pointmaze, pointmaze_dataset
@@ -21,6 +29,7 @@ from torchrl_rad.data.report import report as data_report  # "report" is the mod
 from torchrl_rad.data.windows import Window, WindowSampler, window_buffer
 
 __all__ = [
+    "KITCHEN_TASKS",
     "DataReport",
     "Expert",
     "ExpertDatabase",
@@ -39,11 +48,16 @@ __all__ = [
     "load_hdf5",
     "load_minari",
     "load_ogbench",
+    "newly_done",
     "pointmaze_dataset",
     "reaches_goal",
+    "relabel_tasks",
+    "return_at_least",
     "return_to_go",
     "step_and_remaining",
     "subtasks_done",
+    "tasks_done",
+    "tasks_in_place",
     "top_share_by_return",
     "window_buffer",
     "without_region",

@@ -10,8 +10,7 @@ import torch
 from numpy.typing import NDArray
 from tensordict import TensorDict
 
-from torchrl_rad.data.minari import check_content
-from torchrl_rad.data.report import describe_rows
+from torchrl_rad.data.minari import check_content, check_infos
 
 __all__ = ["flag_rows", "number_rows", "steps_table"]
 
@@ -112,20 +111,3 @@ def steps_table(
     check_content(steps, int(end.sum()), len(end), name)
     check_infos(steps, name)
     return steps
-
-
-def check_infos(steps: TensorDict, name: str) -> None:
-    """Checks what was kept of the infos for NaN and Inf.
-
-    Raises:
-        ValueError: names entry, episode and step.
-    """
-    for key in steps.keys(True, True):
-        if key[0] != "info":
-            continue
-        bad = ~steps[key].isfinite().all(-1)
-        if bad.any():
-            raise ValueError(
-                f"{name}: NaN or Inf in {key!r} at {describe_rows(steps['episode'], bad)}. "
-                "Drop these episodes, or load the set without this entry."
-            )

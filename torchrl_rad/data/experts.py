@@ -15,6 +15,7 @@ __all__ = [
     "expert_from_config",
     "first_hit_within",
     "reaches_goal",
+    "return_at_least",
     "select_episodes",
     "subtasks_done",
     "top_share_by_return",
@@ -138,8 +139,21 @@ def reaches_goal() -> Expert:
     )
 
 
+def return_at_least(value: float) -> Expert:
+    """Episodes whose rewards sum to ``value`` or more.
+
+    The paper's rule for Kitchen, 3, once the rewards are tasks newly done
+    (:func:`~torchrl_rad.data.relabel_tasks`).
+    """
+    config = {"rule": "return_at_least", "args": [value]}
+    return Expert(config, lambda episode: bool(_rewards(episode).double().sum() >= value))
+
+
 def subtasks_done(count: int) -> Expert:
-    """Episodes whose step reward reaches ``count`` (Kitchen: tasks in place; the paper has 3)."""
+    """Episodes whose step reward reaches ``count`` (Kitchen as recorded: tasks in place at once).
+
+    A task that comes undone is not counted then; :func:`return_at_least` counts it.
+    """
     config = {"rule": "subtasks_done", "args": [count]}
     return Expert(config, lambda episode: bool((_rewards(episode) >= count).any()))
 
@@ -179,6 +193,7 @@ RULES: dict[str, Callable[..., Expert]] = {
     "episode_length": episode_length,
     "first_hit_within": first_hit_within,
     "reaches_goal": reaches_goal,
+    "return_at_least": return_at_least,
     "subtasks_done": subtasks_done,
     "top_share_by_return": top_share_by_return,
 }

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -22,6 +22,8 @@ def load_minari(
     adapter: Callable[[Any], np.ndarray] | None = None,
     download: bool = False,
     progress: bool = True,
+    infos: Sequence[str] = (),
+    reward: Callable[[Any], Any] | None = None,
 ) -> TensorDict:
     """Loads any Minari data set, HDF5 or Arrow, as a flat table of steps, and checks what came.
 
@@ -33,17 +35,22 @@ def load_minari(
             ``"observation"`` of a dict.
         download (bool, optional): fetch the set if it is not here. Defaults to ``False``.
         progress (bool, optional): show a progress bar. Defaults to ``True``.
+        infos (sequence of str, optional): entries of the infos to keep, such as ``"qpos"`` and
+            ``"qvel"``, the simulator's state of the row. Defaults to none.
+        reward (callable, optional): observations of one episode [L + 1, ...] -> rewards [L] that
+            replace the recorded ones, such as
+            :func:`~torchrl_rad.data.kitchen.newly_done`.
 
     Returns:
         TensorDict [T], episodes one after the other: ``observation`` [T, S] and ``action`` [T, A]
         float32, ``episode`` [T] int64 (Minari's id), ``("next", "observation")`` [T, S] and
         ``("next", "reward")`` [T, 1] float32, ``("next", "terminated")``, ``("next", "truncated")``
-        and ``("next", "done")`` [T, 1] bool.
+        and ``("next", "done")`` [T, 1] bool, ``("info", name)`` [T, .] float32.
 
     Raises:
         ImportError: Minari is not installed.
         FileNotFoundError: the set is not here, and ``download`` is off or failed.
-        KeyError: the adapter names an entry that the observations lack.
+        KeyError: the adapter names an entry that the observations lack, or infos lack one.
         TypeError: observations or actions are not arrays.
         ValueError: the set cannot be read, is empty, or fails :func:`check_content`.
 
@@ -75,13 +82,14 @@ def load_minari(
         total=dataset.total_episodes,
         disable=not progress,
     )
-    episodes = [_columns(episode, adapter, dataset_id) for episode in bar]
+    episodes = [_columns(episode, adapter, reward, infos, dataset_id) for episode in bar]
     steps = TensorDict({}, [sum(len(columns["action"]) for columns in episodes)])
     for key in list(episodes[0]):  # a column at a time, its parts let go when joined
         steps[key] = torch.from_numpy(np.concatenate([columns.pop(key) for columns in episodes]))
     steps["next", "done"] = steps["next", "terminated"] | steps["next", "truncated"]
     name = f"Minari data set {dataset_id!r}"
     check_content(steps, dataset.total_episodes, dataset.total_steps, name)
+    check_infos(steps, name)
     return steps
 
 
@@ -135,7 +143,7 @@ def _episodes(dataset, dataset_id: str) -> Iterator:
         ) from error
 
 
-def _columns(episode, adapter, dataset_id: str) -> dict:
+def _columns(episode, adapter, reward, infos: Sequence[str], dataset_id: str) -> dict:
     """One episode's entries as arrays [L, ...]; Minari keeps L + 1 observations."""
     states = _states(episode, adapter, dataset_id)
     if isinstance(episode.actions, (dict, tuple, list)):
@@ -150,15 +158,46 @@ def _columns(episode, adapter, dataset_id: str) -> dict:
             f"{len(states)} observations and {len(episode.actions)} actions; "
             f"expected {length + 1} and {length}. Record the episode anew."
         )
-    return {
+    rewards = episode.rewards if reward is None else reward(episode.observations)
+    if len(rewards) != length:
+        raise ValueError(
+            f"Minari data set {dataset_id!r}, episode {episode.id}: {reward} gave {len(rewards)} "
+            f"rewards for {length + 1} observations; expected {length}, one a step."
+        )
+    columns: dict[Any, np.ndarray] = {
         "observation": states[:-1],
         "action": np.asarray(episode.actions, np.float32).reshape(length, -1),
         "episode": np.full(length, episode.id, np.int64),
         ("next", "observation"): states[1:],
-        ("next", "reward"): np.asarray(episode.rewards, np.float32).reshape(length, 1),
+        ("next", "reward"): np.asarray(rewards, np.float32).reshape(length, 1),
         ("next", "terminated"): np.asarray(episode.terminations, bool).reshape(length, 1),
         ("next", "truncated"): np.asarray(episode.truncations, bool).reshape(length, 1),
     }
+    for info in infos:
+        columns["info", info] = _info(episode, info, length, dataset_id)
+    return columns
+
+
+def _info(episode, info: str, length: int, dataset_id: str) -> np.ndarray:
+    """An entry of the infos at the rows' own states: float32 [L, .]."""
+    where = f"Minari data set {dataset_id!r}, episode {episode.id}"
+    if info not in (episode.infos or {}):
+        raise KeyError(
+            f"{where}: infos lack {info!r}; there are {sorted(episode.infos or {})}. Name one of "
+            "these, or load the set without."
+        )
+    try:
+        values = np.asarray(episode.infos[info], np.float32)
+    except (TypeError, ValueError) as error:
+        raise TypeError(
+            f"{where}: {info!r} of the infos is no array of numbers ({error}); name another entry."
+        ) from error
+    if values.ndim == 0 or len(values) != length + 1:
+        raise ValueError(
+            f"{where}: {info!r} of the infos has shape {list(values.shape)}, expected {length + 1} "
+            "rows, one a state. Load the set without it."
+        )
+    return values[:-1].reshape(length, -1)
 
 
 def _states(episode, adapter, dataset_id: str) -> np.ndarray:
@@ -221,6 +260,21 @@ def check_content(
         if key != ("next", "reward") and not td[key].any():
             raise ValueError(
                 f"{name}: {key!r} is 0 in all {len(td)} rows; the data was not read. Load it anew."
+            )
+
+
+def check_infos(steps: TensorDictBase, name: str) -> None:
+    """Checks what was kept of the infos for NaN and Inf.
+
+    Raises:
+        ValueError: names entry, episode and step.
+    """
+    for key in steps.keys(True, True):
+        bad = ~steps[key].isfinite().all(-1) if key[0] == "info" else torch.zeros(0)
+        if bad.any():
+            raise ValueError(
+                f"{name}: NaN or Inf in {key!r} at {describe_rows(steps['episode'], bad)}. "
+                "Drop these episodes, or load the set without this entry."
             )
 
 
