@@ -26,6 +26,7 @@ from torchrl_rad.data.pointmaze import collect_pointmaze, pointmaze_dataset
 from torchrl_rad.data.regions import enters_region, without_region
 from torchrl_rad.data.report import DataReport
 from torchrl_rad.data.report import report as data_report  # "report" is the module
+from torchrl_rad.data.sources import concatenate_steps, load_dataset
 from torchrl_rad.data.windows import Window, WindowSampler, window_buffer
 
 __all__ = [
@@ -37,6 +38,7 @@ __all__ = [
     "WindowSampler",
     "check_content",
     "collect_pointmaze",
+    "concatenate_steps",
     "data_report",
     "enters_region",
     "episode_length",
@@ -45,6 +47,7 @@ __all__ = [
     "first_hit_within",
     "has_successor",
     "join_stream",
+    "load_dataset",
     "load_hdf5",
     "load_minari",
     "load_ogbench",
