@@ -27,6 +27,7 @@ from torchrl_rad import (
     inverse_dynamics_actor,
 )
 from torchrl_rad.checkpoint import Checkpointer, CheckpointError, state_digest
+from torchrl_rad.envs import MazeTask
 from torchrl_rad.experiment import (
     BACKBONE,
     PolicyParts,
@@ -35,9 +36,11 @@ from torchrl_rad.experiment import (
     make_data,
     make_logger,
     make_policies,
+    resolve_dataset,
     share_weights,
     window_sampler,
 )
+from torchrl_rad.learned_value import learn_value
 from torchrl_rad.plots import plot_curves, plot_targets
 from torchrl_rad.policy import save_policy
 from torchrl_rad.precision import uses_bf16
@@ -62,7 +65,11 @@ def make_objectives(cfg: dict[str, Any], policies: dict[str, PolicyParts], train
 
     def denoising(planner) -> Objective:
         module = DenoisingLoss(
-            planner, no_target=loss["no_target"], next_weight=loss["next_weight"], delay=True
+            planner,
+            no_target=loss["no_target"],
+            pseudo_step=loss["pseudo_step"],
+            next_weight=loss["next_weight"],
+            delay=True,
         )
         names = ("lr", "warmup", "weight_decay", "ema")
         options = {name: optim[name] for name in names}
@@ -90,6 +97,8 @@ def make_objectives(cfg: dict[str, Any], policies: dict[str, PolicyParts], train
         module = ReturnGuidanceLoss(
             planner.return_model, jump=network["jumps"][0], gamma=loss["gamma"]
         )
+        if loss["value"] == "iql":
+            module.set_keys(value="value")
         objectives["return"] = Objective(module, lambda windows: windows, steps=steps, **head)
     return objectives
 
@@ -138,7 +147,9 @@ def main_run(run: RunFolder, cfg: dict[str, Any], resume: bool) -> None:
         raise ValueError(f"device is {cfg['device']!r}, but torch sees no GPU; use device=cpu.")
     torch.set_num_threads(cfg["threads"])
     torch.manual_seed(cfg["seed"])  # fresh weights are the same when resumed
-    print(f"run folder: {run.path}", flush=True)
+    if cfg["loss"]["value"] not in ("recorded", "iql"):
+        raise ValueError(f"loss.value is {cfg['loss']['value']!r}; expected 'recorded' or 'iql'.")
+    print(f"run folder: {run.path}\ndata: {cfg['replay_buffer']['dataset']}", flush=True)
     task, data = make_data(cfg)
     print(check_data(task, data), flush=True)
     policies = make_policies(cfg["network"], cfg["retrieval"], data)
@@ -150,12 +161,15 @@ def main_run(run: RunFolder, cfg: dict[str, Any], resume: bool) -> None:
             share = f"{kept} of {total} episodes ({kept / total:.1%})"
             print(f"{name}: {share}, {len(parts.database)} rows", flush=True)
     data = data.to(cfg["device"]) if cfg["device"] != "cpu" else data
+    if cfg["loss"]["value"] == "iql":
+        data["value"] = learn_value(run, cfg, data)
     run_training(run, cfg, policies, data, resume)
     rows, episodes = evaluate_policies(run, cfg, task, policies, data)
     plot_curves(run.metrics.rows(), run.path / "curves.png")
     titles = {name: f"{name}: {rows[name]['score']:.0f}" for name in rows}
     plain = {name: parts.policy for name, parts in policies.items()}
-    plot_targets(task, episodes, plain, titles, run.path / "targets.png")
+    if isinstance(task, MazeTask):
+        plot_targets(task, episodes, plain, titles, run.path / "targets.png")
     print(f"\n{format_table(rows)}\n\n{task.score_source}", flush=True)
 
 
@@ -171,6 +185,7 @@ def main(config: DictConfig) -> None:
             cfg["logger"]["progress"] = progress
         else:
             date = datetime.datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
+            resolve_dataset(cfg)
             folder = cfg["folder"] or f"outputs/{cfg['env']['name']}/{date}-seed{cfg['seed']}"
             run = RunFolder.create(folder, cfg)
         main_run(run, cfg, resume)

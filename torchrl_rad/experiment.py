@@ -18,10 +18,11 @@ from tqdm import tqdm
 from torchrl_rad.checkpoint import read_json
 from torchrl_rad.data.database import ExpertDatabase
 from torchrl_rad.data.episodes import episode_lengths, return_to_go
-from torchrl_rad.data.experts import expert_from_config
+from torchrl_rad.data.experts import expert_from_config, select_episodes
 from torchrl_rad.data.maze2d import maze_dataset
+from torchrl_rad.data.regions import without_region
 from torchrl_rad.data.report import DataReport, report
-from torchrl_rad.data.sources import load_dataset
+from torchrl_rad.data.sources import find_dataset, load_dataset
 from torchrl_rad.data.windows import window_buffer
 from torchrl_rad.envs.maze import MazeTask
 from torchrl_rad.envs.task import Task
@@ -43,8 +44,11 @@ __all__ = [
     "make_data",
     "make_database",
     "make_logger",
+    "load_starts",
     "make_policies",
     "policy_row",
+    "resolve_dataset",
+    "restrict",
     "saved_maze",
     "saved_task",
     "share_weights",
@@ -69,7 +73,8 @@ class PolicyParts:
 def make_data(cfg: Mapping[str, Any]) -> tuple[Task, TensorDictBase]:
     """The task and its recorded steps [T], with ``return_to_go`` at the discount of L_g."""
     task = make_task(cfg["env"])
-    data = task_dataset(task, cfg["replay_buffer"], cfg["logger"]["progress"]).copy()
+    data = task_dataset(task, cfg["replay_buffer"], cfg["logger"]["progress"])
+    data = restrict(task, data, cfg["replay_buffer"]).copy()
     value = return_to_go(data["next", "reward"], episode_lengths(data), cfg["loss"]["gamma"])
     data["return_to_go"] = value
     return task, data
@@ -86,7 +91,43 @@ def task_dataset(task: Task, source: Mapping[str, Any], progress: bool = True) -
     if isinstance(task, MazeTask):
         names = ("dataset", "steps", "seed", "download")
         return maze_dataset(task, **{name: source[name] for name in names}, progress=progress)
-    return task.label(load_dataset(source["dataset"], task.adapter, source["download"], progress))
+    keys = task.adapter.keys
+    return task.label(load_dataset(source["dataset"], keys, (), source["download"], progress))
+
+
+def resolve_dataset(cfg: dict[str, Any]) -> None:
+    """Puts in place of a config's data sets those that are here, so that the run says which.
+
+    Raises:
+        FileNotFoundError: none is here, and none can be fetched.
+    """
+    if cfg["replay_buffer"]["dataset"] != "collected":
+        cfg["replay_buffer"]["dataset"] = find_dataset(cfg["replay_buffer"]["dataset"])
+
+
+def restrict(task: Task, data: TensorDictBase, source: Mapping[str, Any]) -> TensorDictBase:
+    """Recorded steps without a region of the maze, or demonstrations alone, if a config says so.
+
+    Args:
+        task (Task): of a maze where ``without`` is set.
+        data (TensorDictBase): flat steps [T].
+        source (mapping): ``without`` (cells; None for none), ``coverage`` (share of the episodes
+            that enter them and stay) and ``keep`` (config of an expert rule; None for all).
+
+    Raises:
+        ValueError: nothing is left, or the task has no cells.
+    """
+    if source["without"] is not None:
+        centres, half_width = task.cells(source["without"])
+        data = without_region(data, centres, half_width, source["coverage"])
+    if source["keep"] is not None:
+        lengths = episode_lengths(data)
+        rule = expert_from_config(source["keep"])
+        keep = select_episodes(rule, data.split(lengths.tolist()))
+        if not keep.any():
+            raise ValueError(f"no episode is left by replay_buffer.keep={rule}.")
+        data = data[torch.repeat_interleave(keep, lengths)]
+    return data
 
 
 def check_data(task: Task, data: TensorDictBase) -> DataReport:
@@ -180,8 +221,8 @@ def share_weights(policies: Mapping[str, PolicyParts], trained: str) -> None:
 def window_sampler(data: TensorDictBase, horizon: int, batch_size: int):
     """A function that draws windows [batch_size, horizon] of recorded steps."""
     kept = data.select(
-        "observation", "action", "episode", "return_to_go",
-        ("next", "observation"), ("next", "reward"),
+        "observation", "action", "episode", "return_to_go", "value",
+        ("next", "observation"), ("next", "reward"), strict=False,
     )  # fmt: skip
     buffer = window_buffer(kept, horizon, batch_size)
     return lambda: buffer.sample().reshape(-1, horizon)
@@ -257,6 +298,28 @@ def collect_episodes(
         return evaluate(env, act, max_steps, progress=bar.update)
 
 
+def load_starts(settings: Mapping[str, Any] | None) -> Any:
+    """Where episodes begin, for :meth:`~torchrl_rad.envs.Task.make_env`; None: the task's own.
+
+    Args:
+        settings (mapping, optional): ``cells``, a list of (row, column); or ``states``, names of a
+            data set as of :func:`~torchrl_rad.data.find_dataset`, whose infos hold ``qpos`` and
+            ``qvel``.
+
+    Raises:
+        FileNotFoundError: the data set is not here.
+        ValueError: neither is given.
+    """
+    if settings is None:
+        return None
+    if settings.get("cells"):
+        return [tuple(cell) for cell in settings["cells"]]
+    if not settings.get("states"):
+        raise ValueError(f"evaluation.starts is {dict(settings)}; expected cells or states.")
+    names = find_dataset(settings["states"])
+    return load_dataset(names, infos=("qpos", "qvel"), progress=False)["info"]
+
+
 def make_logger(run: RunFolder, cfg: Mapping[str, Any]) -> Callable[[int, dict[str, float]], None]:
     """Writes ``metrics.csv``, and to TensorBoard or W&B if the config names one of them.
 
@@ -309,7 +372,8 @@ def evaluate_policies(
         steps = run.load_episodes(name)
         if steps is None:
             seed = settings["seed"] + cfg["seed"]
-            env = task.make_env(settings["episodes"]) if env is None else env
+            if env is None:
+                env = task.make_env(settings["episodes"], starts=load_starts(settings["starts"]))
             dtype = planning_dtype(cfg["optim"]["precision"], cfg["device"])
             steps = collect_episodes(
                 env, parts.policy, task.max_steps, seed, name, dtype, progress=progress

@@ -200,7 +200,7 @@ def test_wrong_width():
         ({"activation": "tanh"}, "activation is 'tanh'; expected 'softmax' or 'sigmoid'"),
         (
             {"estimate": "best"},
-            "estimate is 'best'; expected 'mode', 'median', 'mean' or 'recorded'",
+            "estimate is 'best'; expected one of",
         ),
     ],
 )

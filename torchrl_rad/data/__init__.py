@@ -26,7 +26,7 @@ from torchrl_rad.data.pointmaze import collect_pointmaze, pointmaze_dataset
 from torchrl_rad.data.regions import enters_region, without_region
 from torchrl_rad.data.report import DataReport
 from torchrl_rad.data.report import report as data_report  # "report" is the module
-from torchrl_rad.data.sources import concatenate_steps, load_dataset
+from torchrl_rad.data.sources import concatenate_steps, find_dataset, load_dataset
 from torchrl_rad.data.windows import Window, WindowSampler, window_buffer
 
 __all__ = [
@@ -44,6 +44,7 @@ __all__ = [
     "episode_length",
     "episode_lengths",
     "expert_from_config",
+    "find_dataset",
     "first_hit_within",
     "has_successor",
     "join_stream",

@@ -14,7 +14,9 @@ from torchrl_rad.data.minari import load_minari
 from torchrl_rad.data.ogbench import load_ogbench
 from torchrl_rad.envs.adapter import ObservationAdapter
 
-__all__ = ["concatenate_steps", "load_dataset"]
+__all__ = ["concatenate_steps", "find_dataset", "load_dataset"]
+
+FILES = (".hdf5", ".h5", ".npz")
 
 
 def load_dataset(
@@ -60,12 +62,64 @@ def load_dataset(
         parts = [load_dataset(each, keys, infos, download, progress) for each in source]
         return concatenate_steps(parts, [str(each) for each in source])
     ending = Path(source).suffix.lower()
-    if ending in (".hdf5", ".h5"):
+    if ending in FILES[:2]:
         return load_hdf5(source, infos=infos)
-    if ending == ".npz":
+    if ending in FILES:
         return load_ogbench(source, infos)
     adapter = ObservationAdapter(keys)
     return load_minari(str(source), adapter, download, progress, infos)
+
+
+def find_dataset(names: str | Sequence[str]) -> list[str]:
+    """The first of some data sets that is on this machine, else the first that can be fetched.
+
+    Args:
+        names (str or sequence of str): Minari ids, and files, looked for where their path says and
+            in ``$TORCHRL_RAD_DATA`` (``data``); ``"a+b"`` is both of them together.
+
+    Returns:
+        What to pass to :func:`load_dataset`.
+
+    Raises:
+        FileNotFoundError: none is here, and none is a Minari id.
+
+    Examples:
+        >>> import tempfile
+        >>> path = Path(tempfile.mkdtemp()) / "tiny-v0.npz"
+        >>> path.touch()
+        >>> find_dataset(["nowhere.hdf5", str(path)]) == [str(path)]
+        True
+        >>> find_dataset(["nowhere.hdf5", "mujoco/hopper/medium-v0+mujoco/hopper/expert-v0"])
+        ['mujoco/hopper/medium-v0', 'mujoco/hopper/expert-v0']
+    """
+    names = [names] if isinstance(names, str) else list(names)
+    for name in names:
+        found = [_here(part) for part in name.split("+")]
+        if all(found):
+            return [part for part in found if part]
+    for name in names:
+        if not name.endswith(FILES):
+            return name.split("+")
+    raise FileNotFoundError(
+        f"none of the data sets {names} is here; looked for where these paths say and in "
+        f"{_folder()}. Put the file there, or name its folder by TORCHRL_RAD_DATA."
+    )
+
+
+def _folder() -> Path:
+    return Path(os.environ.get("TORCHRL_RAD_DATA", "data")).absolute()
+
+
+def _here(name: str) -> str | None:
+    """The path or id of a data set on this machine."""
+    if name.endswith(FILES):
+        paths = [path for path in (Path(name), _folder() / name) if path.exists()]
+        return str(paths[0]) if paths else None
+    try:
+        import minari
+    except ImportError:
+        return None
+    return name if name in minari.list_local_datasets() else None
 
 
 def concatenate_steps(

@@ -11,9 +11,10 @@ import gymnasium as gym
 import gymnasium_robotics
 import numpy as np
 from tensordict import TensorDictBase
+from torch import Tensor
 
 from torchrl_rad.envs.adapter import ObservationAdapter
-from torchrl_rad.envs.maze import maze_cells, relabel_goal
+from torchrl_rad.envs.maze import cell_centres, maze_cells, relabel_goal
 from torchrl_rad.envs.task import Task
 
 __all__ = ["AntMazeTask", "FixedGoalAntMaze"]
@@ -26,9 +27,9 @@ class AntMazeTask(Task):
     """gymnasium-robotics' AntMaze by D4RL's protocol: one goal cell, over when it is reached.
 
     The state is x, y and the 27 entries of the ant's body. The score is the share of episodes that
-    reach the goal. Recorded steps are rewarded where the next state lies within 0.5 of the centre
-    of the goal cell. ``starts`` of :meth:`make_env` are cells (row, column), which rows take in
-    turn.
+    reach the goal. Recorded steps are rewarded, and terminated, where the next state lies within
+    0.5 of the centre of the goal cell; an episode goes on until it was cut. ``starts`` of
+    :meth:`make_env` are cells (row, column), which rows take in turn.
 
     Attributes:
         name: of the task.
@@ -57,10 +58,16 @@ class AntMazeTask(Task):
         cells = [self.reset_cell] if starts is None else list(starts)
         return FixedGoalAntMaze(self, cells[number % len(cells)])
 
-    def label(self, steps: TensorDictBase) -> TensorDictBase:
+    def cells(self, cells: Sequence[tuple[int, int]]) -> tuple[Tensor, float]:
         env = FixedGoalAntMaze(self)
         env.close()
-        return relabel_goal(steps, env.goal)
+        return cell_centres(self.env_id, env.maze, cells)
+
+    def label(self, steps: TensorDictBase) -> TensorDictBase:
+        labelled = relabel_goal(steps, self.cells([self.goal_cell])[0][0])
+        # the task is over there, though the recording went on
+        labelled["next", "terminated"] = labelled["next", "reward"] > 0
+        return labelled
 
 
 class FixedGoalAntMaze(gym.Wrapper):

@@ -8,7 +8,9 @@ from typing import Any
 import gymnasium as gym
 import gymnasium_robotics
 import numpy as np
+from tensordict import TensorDictBase
 
+from torchrl_rad.data.kitchen import relabel_tasks
 from torchrl_rad.envs.task import Task
 
 __all__ = ["KitchenTask"]
@@ -42,6 +44,9 @@ class KitchenTask(Task):
     @property
     def reference_scores(self) -> tuple[float, float]:  # type: ignore[override]
         return 0.0, float(len(self.subtasks))
+
+    def label(self, steps: TensorDictBase) -> TensorDictBase:
+        return relabel_tasks(steps, self.subtasks)
 
     def make_row(self, number: int, starts: Any = None) -> gym.Env:
         if starts is not None:

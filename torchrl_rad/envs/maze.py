@@ -59,9 +59,12 @@ class MazeTask(Task):
     def starts(self) -> Tensor:
         env = FixedGoalMaze(self)
         env.close()
-        return torch.tensor(
-            np.stack([env.maze.cell_rowcol_to_xy(cell) for cell in env.reset_cells])
-        ).float()
+        return self.cells(env.reset_cells.tolist())[0]
+
+    def cells(self, cells: Sequence[tuple[int, int]]) -> tuple[Tensor, float]:
+        env = FixedGoalMaze(self)
+        env.close()
+        return cell_centres(self.env_id, env.maze, cells)
 
 
 MAZES = {
@@ -173,6 +176,13 @@ def maze_cells(env_id: str, maze_map: list[list[Any]], **cells: Any) -> list[np.
             )
         found.append(cell)
     return found
+
+
+def cell_centres(env_id: str, maze: Any, cells: Sequence[Any]) -> tuple[Tensor, float]:
+    """Centres [n, 2] of cells of gymnasium-robotics' maze, and half of a cell's side."""
+    found = [maze_cells(env_id, maze.maze_map, cell=cell)[0] for cell in cells]
+    centres = np.stack([maze.cell_rowcol_to_xy(cell) for cell in found])
+    return torch.from_numpy(centres).float(), maze.maze_size_scaling / 2
 
 
 def maze_cell(text: str) -> tuple[int, int]:

@@ -48,6 +48,14 @@ class Task(ABC):
         """Where episodes begin, [n, 2 or more], if that is known beforehand."""
         return None
 
+    def cells(self, cells: Sequence[tuple[int, int]]) -> tuple[Tensor, float]:
+        """Centres [n, 2] of cells (row, column) of a maze, and half of a cell's side.
+
+        Raises:
+            ValueError: the task has no cells, or one is a wall.
+        """
+        raise ValueError(f"{self.name} has no cells: it is no maze.")
+
     def label(self, steps: TensorDictBase) -> TensorDictBase:
         """Gives recorded steps [T] the rewards of this task; as they are unless it says else."""
         return steps
