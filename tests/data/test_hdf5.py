@@ -151,6 +151,24 @@ def test_antmaze_with_other_ends(path):
     assert ends(td, "terminated") == [2, 3, 4, 7, 8, 9, 11] and ends(td, "truncated") == [5]
 
 
+def test_antmaze_with_rewards_of_minus_one_and_zero(path):
+    arrays = antmaze()
+    td = load_hdf5(write(path, {**arrays, "rewards": arrays["rewards"] - 1}))
+    assert lengths(td) == [6, 6]
+
+
+@pytest.mark.parametrize("pay", [0.0, 1.0])
+def test_ends_in_a_row_that_pay_no_more_than_other_rows(path, pay):
+    arrays = antmaze()
+    arrays["rewards"][0] = arrays["rewards"][2] = pay
+    assert ends(load_hdf5(write(path, arrays))) == [2, 3, 4, 5, 7, 8, 9, 11]
+
+
+def test_episodes_of_one_row(path):
+    td = load_hdf5(write(path, rows(terminals=np.ones(6, bool))))
+    assert lengths(td) == [1] * 6 and ends(td, "terminated") == list(range(6))
+
+
 def test_true_ends_at_the_goal_are_cut(path):
     # rewards and terminals agree as in antmaze, but no end follows another one
     hit = marked(12, [3, 7])

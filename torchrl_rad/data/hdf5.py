@@ -36,8 +36,9 @@ def load_hdf5(
 
     What ends an episode is read off the file: the flags that are set somewhere (locomotion, where
     ``terminals`` is a fall and ``timeouts`` the limit; Kitchen, which has ``terminals`` only). Two
-    families differ. AntMaze's ``terminals`` mark rows at the goal while the ant walks on: rewards
-    are paid there, and most are followed by another one; then ``timeouts`` alone end an episode.
+    families differ. AntMaze's ``terminals`` mark rows at the goal while the ant walks on: they
+    pay more than all others and most are followed by another one; then ``timeouts`` alone end an
+    episode.
     Maze2D without flags is one stream, cut where ``infos/goal`` changes.
 
     No row is dropped, so that the lengths and returns of episodes are the recorded ones. In files
@@ -208,14 +209,16 @@ def _default_ends(
 
 
 def _mark_the_goal(marks: dict[str, NDArray], reward: NDArray) -> bool:
-    """Whether terminals are labels in a stream: all are paid, and most come in a row.
+    """Whether terminals are labels in a stream: they pay more than other rows and come in a row.
 
-    After a true end a new episode begins, hardly ever with an end.
+    After a true end a new episode begins, which hardly ever ends at once.
     """
     terminals = marks["terminals"]
+    if terminals.all() or not reward[terminals].min() > reward[~terminals].max():
+        return False
     inside = terminals & ~marks.get("timeouts", np.zeros_like(terminals))
     again = terminals[1:] & inside[:-1]
-    return bool((reward[terminals] > 0).all()) and 2 * int(again.sum()) > int(inside.sum())
+    return 2 * int(again.sum()) > int(inside.sum())
 
 
 def _cuts(
@@ -254,7 +257,9 @@ def _following(
 ) -> NDArray:
     """Next observations [N, S]: recorded, or of the following row, or the row's own at a reset."""
     if "next_observations" not in arrays:
-        return np.where(reset[:, None], observation, np.roll(observation, -1, axis=0))
+        following = np.concatenate([observation[1:], observation[-1:]])
+        following[reset] = observation[reset]
+        return following
     where = f"{name}: 'next_observations'"
     following = number_rows(arrays["next_observations"], where, len(observation))
     if following.shape != observation.shape:

@@ -106,7 +106,7 @@ def _read(path: str | Path, needed: list[str]) -> dict[str, NDArray]:
             for key in needed:
                 arrays[key] = archive[key]
             return arrays
-    except (OSError, EOFError, ValueError, zipfile.BadZipFile, zlib.error) as error:
+    except (OSError, EOFError, RuntimeError, ValueError, zipfile.BadZipFile, zlib.error) as error:
         if "allow_pickle" in str(error):
             raise TypeError(
                 f"{path}: {key!r} holds Python objects, which are not read, since they can run "
