@@ -232,6 +232,12 @@ def test_recorded_next_observations_are_taken(path):
     assert has_successor(td).all()
 
 
+def test_a_state_that_stands_still_is_a_successor(path):
+    states = np.float32([[1], [1], [2], [3], [3], [4]])
+    td = load_hdf5(write(path, rows(observations=states)))
+    assert has_successor(td).tolist() == [True, True, False, True, True, False]
+
+
 def test_other_dtypes(path):
     arrays = rows()
     arrays["observations"] = arrays["observations"].astype(np.float64)

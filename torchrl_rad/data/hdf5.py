@@ -194,9 +194,9 @@ def _default_ends(
         if "timeouts" in used:
             return ("timeouts",)
         raise ValueError(
-            f"{name}: 'terminals' are rows at the goal, not ends, and 'timeouts' are missing, so "
-            "that nothing says where episodes end. Fetch version 2 of the set, or pass ends=()"
-            " with max_steps."
+            f"{name}: 'terminals' are rows at the goal, not ends, and 'timeouts' are missing or "
+            "never set, so that nothing says where episodes end. Fetch version 2 of the set, which "
+            "has them, or write them into a copy of the file."
         )
     if used or max_steps is not None:
         return used
@@ -242,7 +242,7 @@ def _cuts(
         end |= marks[key]
     flagged = [marks[key] for key in ends if key in FLAGS]
     reset = np.logical_or.reduce(flagged) if flagged else np.zeros(count, bool)
-    end[-1] = reset[-1] = True
+    end[-1] = True
     if max_steps is None:
         return end, reset
     lengths = torch.from_numpy(np.diff(np.flatnonzero(end), prepend=-1))
