@@ -89,8 +89,9 @@ def task_dataset(task: Task, source: Mapping[str, Any], progress: bool = True) -
         progress (bool, optional): show a progress bar. Defaults to ``True``.
     """
     if isinstance(task, MazeTask):
-        names = ("dataset", "steps", "seed", "download")
-        return maze_dataset(task, **{name: source[name] for name in names}, progress=progress)
+        options = {name: source[name] for name in ("steps", "seed", "download")}
+        (name,) = source["dataset"] if isinstance(source["dataset"], list) else [source["dataset"]]
+        return maze_dataset(task, name, **options, progress=progress)
     keys = task.adapter.keys
     return task.label(load_dataset(source["dataset"], keys, (), source["download"], progress))
 
