@@ -9,18 +9,23 @@ from unittest import mock
 import pytest
 import torch
 
-from torchrl_rad import make_maze_env, maze_task
+from torchrl_rad import MazeTask, make_maze_env, make_task, maze_task
+from torchrl_rad.checkpoint import CheckpointError, write_json
 from torchrl_rad.data.pointmaze import pointmaze_dataset
 from torchrl_rad.experiment import (
     BACKBONE,
     check_data,
     collect_episodes,
     evaluate_policies,
+    load_starts,
     make_data,
     make_database,
     make_logger,
     make_policies,
     policy_row,
+    restrict,
+    saved_maze,
+    saved_task,
     share_weights,
     step_error,
     window_sampler,
@@ -52,15 +57,16 @@ RETRIEVAL = {
 CONFIG = {
     "seed": 0,
     "device": "cpu",
-    "env": {"name": "pointmaze-umaze", "maze": "umaze"},
+    "env": {"name": "pointmaze-umaze", "family": "pointmaze", "maze": "umaze"},
     "replay_buffer": {
-        "dataset": "collected", "steps": 3000, "seed": 0, "download": False, "batch_size": 8
+        "dataset": "collected", "steps": 3000, "seed": 0, "download": False, "batch_size": 8,
+        "without": None, "coverage": 0.0, "keep": None,
     },
     "optim": {"precision": "fp32"},
     "network": NETWORK,
     "loss": {"gamma": 0.9},
     "logger": {"backend": "csv", "mode": "offline", "project_name": "tests", "progress": False},
-    "evaluation": {"episodes": 2, "seed": 10_000},
+    "evaluation": {"episodes": 2, "seed": 10_000, "starts": None},
 }  # fmt: skip
 TASK = maze_task("umaze")
 
@@ -94,6 +100,70 @@ def test_data(data):
     last = data["next", "done"].squeeze(-1)
     following = torch.where(last, 0.0, value.roll(-1))
     torch.testing.assert_close(value, reward + 0.9 * following, atol=1e-5, rtol=1e-5)
+
+
+def test_a_region_is_left_out(data):
+    source = {**CONFIG["replay_buffer"], "without": [[3, 1]]}
+    left = restrict(TASK, data, source)
+    centre, half = TASK.cells([(3, 1)])
+    assert half == 0.5
+    inside = ((left["observation"][:, :2] - centre).abs() <= half).all(-1)
+    assert 0 < len(left) < len(data) and not inside.any()
+    # episodes are whole
+    counts = {int(e): int((data["episode"] == e).sum()) for e in left["episode"].unique()}
+    assert {e: int((left["episode"] == e).sum()) for e in counts} == counts
+    assert len(restrict(TASK, data, {**source, "coverage": 1.0})) == len(data)
+
+
+def test_demonstrations_alone(data):
+    keep = {"rule": "reaches_goal", "args": []}
+    left = restrict(TASK, data, {**CONFIG["replay_buffer"], "keep": keep})
+    assert len(left) == len(make_database(data, RETRIEVAL["paper"]))
+    none = {"rule": "first_hit_within", "args": [0, 0]}
+    with pytest.raises(ValueError, match="no episode is left by replay_buffer.keep=first_hit"):
+        restrict(TASK, data, {**CONFIG["replay_buffer"], "keep": none})
+
+
+def test_a_region_of_what_is_no_maze(data):
+    hopper = make_task({"name": "hopper", "family": "locomotion", "env_id": "Hopper-v5"})
+    with pytest.raises(ValueError, match="hopper has no cells: it is no maze"):
+        restrict(hopper, data, {**CONFIG["replay_buffer"], "without": [[1, 1]]})
+    with pytest.raises(ValueError, match="is a wall or outside the map"):
+        restrict(TASK, data, {**CONFIG["replay_buffer"], "without": [[0, 0]]})
+
+
+def test_starts(tmp_path):
+    h5py = pytest.importorskip("h5py")
+    assert load_starts(None) is None
+    assert load_starts({"cells": [[1, 1], [2, 3]]}) == [(1, 1), (2, 3)]
+    with pytest.raises(ValueError, match="expected cells or states"):
+        load_starts({"cells": []})
+    with pytest.raises(FileNotFoundError, match="nowhere.hdf5"):
+        load_starts({"states": "nowhere.hdf5"})
+    torch.manual_seed(0)
+    with h5py.File(tmp_path / "random.hdf5", "w") as file:
+        for name, width in (("observations", 11), ("actions", 3)):
+            file[name] = torch.randn(6, width).numpy()
+        file["rewards"], file["terminals"] = torch.ones(6).numpy(), [False] * 6
+        file["timeouts"] = [False, False, True] * 2
+        qpos = torch.randn(6, 6)
+        file["infos/qpos"], file["infos/qvel"] = qpos.numpy(), torch.randn(6, 6).numpy()
+    starts = load_starts({"states": str(tmp_path / "random.hdf5")})
+    assert torch.allclose(starts["qpos"].float(), qpos) and starts["qvel"].shape == (6, 6)
+    hopper = make_task({"name": "hopper", "family": "locomotion", "env_id": "Hopper-v5"})
+    hopper.make_row(0, starts).reset(seed=0)
+
+
+def test_task_of_a_saved_policy(tmp_path):
+    write_json(tmp_path / "policy.json", {"env": CONFIG["env"]})
+    assert saved_maze(tmp_path) == saved_task(tmp_path) == TASK
+    robot = {"name": "hopper", "family": "locomotion", "env_id": "Hopper-v5"}
+    write_json(tmp_path / "policy.json", {"env": robot})
+    assert saved_task(tmp_path).max_steps == 1000
+    with pytest.raises(ValueError, match="is of hopper; this needs one of a PointMaze"):
+        saved_maze(tmp_path)
+    with pytest.raises((FileNotFoundError, CheckpointError)):
+        saved_task(tmp_path / "nowhere")
 
 
 def test_data_without_faults(data):
@@ -242,7 +312,7 @@ def test_what_was_evaluated_is_not_done_again(tmp_path, policies, data, monkeypa
     def refuse(*args, **kwargs):
         raise AssertionError("driven again")
 
-    monkeypatch.setattr("torchrl_rad.experiment.make_maze_env", refuse)
+    monkeypatch.setattr(MazeTask, "make_env", refuse)
     rows, episodes = evaluate_policies(run, CONFIG, TASK, policies, data)
     assert list(rows) == list(episodes) == list(policies)
     assert (episodes["paper"] == steps).all()

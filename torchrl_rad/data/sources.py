@@ -114,7 +114,7 @@ def _here(name: str) -> str | None:
     """The path or id of a data set on this machine."""
     if name.endswith(FILES):
         paths = [path for path in (Path(name), _folder() / name) if path.exists()]
-        return str(paths[0]) if paths else None
+        return str(paths[0].absolute()) if paths else None
     try:
         import minari
     except ImportError:
