@@ -384,6 +384,45 @@ def test_pickles_small():
 # a target kept for several steps
 
 
+# one of the best
+
+
+@pytest.mark.parametrize("among", [2, 5])
+@pytest.mark.parametrize("rule", [RULES[0], RULES[2]], ids=["highest", "followed"])
+def test_one_of_the_best_is_drawn(rule, among):
+    made, state = database(walks()), queries(1)
+    found = made.retrieve(state)
+    best = module(made, **rule)
+    best.select(state)
+    ranked, rows = best._columns.rule, found["index"][0][found["valid"][0]]
+    # the targets of all neighbours, best first: by brute force over what each leads to
+    order = sorted((-int(ranked.rank[i]), int(ranked.target[i])) for i in rows.tolist())
+    allowed = list(dict.fromkeys(target for _, target in order))[:among]
+    assert len(allowed) == among
+    torch.manual_seed(0)
+    out = ask(module(made, **rule, among=among), state.expand(3000, -1))
+    count = out["target_index"][:, 0].bincount()
+    assert sorted(count.nonzero()[:, 0].tolist()) == sorted(allowed)
+    assert (count[allowed] - 3000 / among).abs().max() < 160
+    shift = out["target_index"] - out["target_offset"]
+    assert torch.isin(shift[:, 0], rows).all()
+    assert out["found"].all()
+
+
+def test_among_more_than_there_are():
+    made = database(walks(), k=1)
+    expected, out = (ask(module(made, among=n), queries()) for n in (1, 7))
+    assert all(torch.equal(out[name], expected[name]) for name in NAMES)
+    assert 0 < out["found"].sum() < len(queries())
+
+
+@pytest.mark.parametrize("settings", [{"among": 0}, {"among": 2, "tolerance": 0.1},
+                                      {"among": 2, "goal_key": "goal"}])  # fmt: skip
+def test_among_is_refused(settings):
+    with pytest.raises(ValueError, match="among is .; expected 1, or more without a tolerance"):
+        module(database(), **settings)
+
+
 # a goal of its own for each row
 
 

@@ -26,7 +26,7 @@ PAPER = {  # RAD's appendix: horizon, jumps, expert rule, similarity
     "hopper": (129, [32, 8, 1], ("episode_length", [1000]), "cosine", 0.6),
     "halfcheetah": (129, [32, 8, 1], ("episode_length", [1000]), "cosine", 0.6),
     "walker2d": (129, [32, 8, 1], ("episode_length", [1000]), "cosine", 0.6),
-    "kitchen": (49, [16, 4, 1], ("subtasks_done", [3]), "cosine", 0.9),
+    "kitchen": (49, [16, 4, 1], ("return_at_least", [3]), "cosine", 0.9),
 }
 
 

@@ -18,7 +18,13 @@ from torchrl_rad.data.experts import select_episodes
 from torchrl_rad.modules.kept import KEPT, keep_or_renew, kept_primer
 from torchrl_rad.retrieval.goal_rules import GoalRule
 from torchrl_rad.retrieval.goals import GoalReward, GoalTable
-from torchrl_rad.retrieval.rules import TargetRule, followed_rule, highest_rule
+from torchrl_rad.retrieval.rules import (
+    NoisyRule,
+    RankedRule,
+    TargetRule,
+    followed_rule,
+    highest_rule,
+)
 
 __all__ = ["RetrievalTargetModule"]
 
@@ -88,6 +94,8 @@ class RetrievalTargetModule(TensorDictModuleBase):
             (``("retrieval", "kept")``), see :meth:`make_tensordict_primer`. Defaults to ``1``.
         min_offset (int, optional): smallest step ahead by ``"highest"``, as far as the episode
             goes. Defaults to ``0``.
+        among (int, optional): the target is drawn from so many of the best ones, with torch's
+            global generator, to see what a spoiled ranking costs. Defaults to ``1``: the best.
         goal_key (NestedKey, optional): the goal of each row. Defaults to none: returns are the
             recorded ones.
         goal_reward (GoalReward, optional): when a goal is reached. Defaults to within 0.5 of it.
@@ -125,6 +133,7 @@ class RetrievalTargetModule(TensorDictModuleBase):
         ahead: int = 16,
         retrieval_interval: int = 1,
         min_offset: int = 0,
+        among: int = 1,
         goal_key: NestedKey | None = None,
         goal_reward: GoalReward | None = None,
         in_keys: Sequence[NestedKey] = ("observation",),
@@ -151,6 +160,10 @@ class RetrievalTargetModule(TensorDictModuleBase):
             raise ValueError(
                 f"expected one in_key and five to seven out_keys, got {in_keys} and {out_keys}."
             )
+        if among < 1 or (among > 1 and (tolerance > 0 or goal_key is not None)):
+            raise ValueError(
+                f"among is {among}; expected 1, or more without a tolerance and a goal_key."
+            )
         if goal_key is not None and tolerance > 0:
             raise ValueError(f"tolerance is {tolerance}; with a goal_key it must be 0.")
         if goal_key is None and goal_reward is not None:
@@ -159,6 +172,7 @@ class RetrievalTargetModule(TensorDictModuleBase):
         self.__dict__["database"] = database
         self.horizon, self.rule, self.tolerance, self.ahead = horizon, rule, tolerance, ahead
         self.retrieval_interval, self.min_offset = retrieval_interval, min_offset
+        self.among = among
         self.goal_key = goal_key
         self.goal_reward = GoalReward() if goal_reward is None else goal_reward
         self.in_keys, self.out_keys = list(in_keys), list(out_keys)
@@ -293,6 +307,9 @@ class RetrievalTargetModule(TensorDictModuleBase):
             else:
                 settings = (self.horizon, self.min_offset, self.tolerance)
                 rule = highest_rule(values, remaining, *settings)
+            if self.among > 1:
+                assert isinstance(rule, RankedRule)
+                rule = NoisyRule(rule, self.among)
             self._columns = columns = _Columns(source, version, rows[key], rule)
         return columns
 

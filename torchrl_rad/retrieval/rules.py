@@ -12,7 +12,15 @@ from torchrl_rad.retrieval.windows import WindowMax
 if TYPE_CHECKING:
     from torchrl_rad.retrieval.sampler import RetrievalSampler
 
-__all__ = ["Choice", "RankedRule", "TargetRule", "TolerantRule", "followed_rule", "highest_rule"]
+__all__ = [
+    "Choice",
+    "NoisyRule",
+    "RankedRule",
+    "TargetRule",
+    "TolerantRule",
+    "followed_rule",
+    "highest_rule",
+]
 
 
 class Choice(NamedTuple):
@@ -69,6 +77,45 @@ class RankedRule(NamedTuple):
     def value(self, rows: Tensor, goals: Tensor | None = None) -> Tensor:
         """As :meth:`TargetRule.value`."""
         return self.values.index_select(0, rows)
+
+
+class NoisyRule(NamedTuple):
+    """One of the best targets of each query, each of them as likely as another.
+
+    It is the spoiled ranking of RAD, appendix "Sensitivity to Imperfect Ranking".
+
+    Attributes:
+        rule: says which targets are better.
+        among: number of targets; fewer where there are no more.
+    """
+
+    rule: RankedRule
+    among: int
+
+    def choose(
+        self, sampler: RetrievalSampler, storage: Any, query: Tensor, goals: Tensor | None = None
+    ) -> Choice:
+        """As :meth:`TargetRule.choose`; drawn with torch's global generator."""
+        rows, near = sampler.nearest(storage, query)  # [Q, k]
+        valid = near >= sampler.threshold
+        targets = self.rule.target[rows.clamp_min(0)]
+        left = torch.where(valid, self.rule.rank[rows.clamp_min(0)], -1)
+        places = []
+        for _ in range(self.among):
+            place = left.argmax(-1, keepdim=True)  # of equals the more similar one
+            best = left.gather(-1, place)
+            places.append(torch.where(best >= 0, place, -1))
+            left = torch.where(targets == targets.gather(-1, place), -1, left)
+        ranked = torch.cat(places, -1)  # [Q, among]
+        count = (ranked >= 0).sum(-1).clamp_min(1)
+        drawn = (torch.rand(len(query), device=count.device) * count).long()
+        place = ranked.gather(-1, drawn[:, None]).clamp_min(0)
+        target, row = targets.gather(-1, place)[:, 0], rows.gather(-1, place)[:, 0]
+        return Choice(target, row, near.gather(-1, place)[:, 0], valid[:, 0])
+
+    def value(self, rows: Tensor, goals: Tensor | None = None) -> Tensor:
+        """As :meth:`TargetRule.value`."""
+        return self.rule.value(rows)
 
 
 class TolerantRule:
