@@ -253,7 +253,7 @@ def test_step_error_by_hand(policies, monkeypatch):
         "target": torch.zeros(3, 4),
         "target_step": torch.tensor([[1], [4], [8]]),
     }
-    monkeypatch.setattr("torchrl_rad.experiment.draw_step_pairs", lambda *_, **__: pairs)
+    monkeypatch.setattr("torchrl_rad.experiment.scoring.draw_step_pairs", lambda *_, **__: pairs)
     logits = torch.full((3, 5), -9.0)
     logits[0, 0] = logits[1, 1] = logits[2, 4] = 9.0  # steps 1, 2 and 5: errors 0, 2 and 3
     monkeypatch.setattr(type(policy[1]), "logits", lambda *_: logits)

@@ -1,0 +1,182 @@
+"""The whole of a run, whatever planner it is of: from the command line to the table."""
+
+from __future__ import annotations
+
+import datetime
+import logging
+import sys
+import warnings
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from torchrl._utils import logger as torchrl_logger
+from torchrl.record.loggers import get_logger
+
+from torchrl_rad.checkpoint import Checkpointer, CheckpointError, state_digest
+from torchrl_rad.envs.maze import MazeTask
+from torchrl_rad.experiment.data import check_data, make_data, resolve_dataset, window_sampler
+from torchrl_rad.experiment.policies import BACKBONE, PolicyParts, make_policies, share_weights
+from torchrl_rad.experiment.scoring import evaluate_policies
+from torchrl_rad.learned_value import learn_value
+from torchrl_rad.plots import plot_curves, plot_targets
+from torchrl_rad.policy import save_policy
+from torchrl_rad.results import format_table
+from torchrl_rad.runs import RunFolder
+from torchrl_rad.training import Interrupted, Objective, train
+
+__all__ = [
+    "MakeObjectives",
+    "make_logger",
+    "run_recipe",
+    "train_policies",
+]
+
+# config, policies and the name of the one that is trained -> objectives by name
+MakeObjectives = Callable[[dict[str, Any], Mapping[str, PolicyParts], str], dict[str, Objective]]
+
+# what a user can mend; OSError is a full disk or a folder that cannot be written
+ERRORS = (CheckpointError, FloatingPointError, ImportError, KeyError, OSError, ValueError)
+
+
+def make_logger(run: RunFolder, cfg: Mapping[str, Any]) -> Callable[[int, dict[str, float]], None]:
+    """Writes ``metrics.csv``, and to TensorBoard or W&B if the config names one of them.
+
+    Raises:
+        ValueError: another backend.
+    """
+    settings = cfg["logger"]
+    backend = settings["backend"]
+    if backend not in ("csv", "tensorboard", "wandb"):
+        raise ValueError(
+            f"logger.backend is {backend!r}; expected 'csv', 'tensorboard' or 'wandb'."
+        )
+    other = None
+    if backend != "csv":
+        options = {"mode": settings["mode"], "project": settings["project_name"], "config": cfg}
+        other = get_logger(
+            backend,
+            logger_name=str(run.path / backend),
+            experiment_name=run.path.name,
+            **({"wandb_kwargs": options} if backend == "wandb" else {}),
+        )
+
+    def log(step: int, values: dict[str, float]) -> None:
+        run.metrics.write(step, values)
+        if other is not None:
+            other.log_metrics(values, step=step)
+
+    return log
+
+
+def train_policies(
+    run: RunFolder,
+    cfg: dict[str, Any],
+    policies: Mapping[str, PolicyParts],
+    data: TensorDictBase,
+    make_objectives: MakeObjectives,
+    resume: bool,
+) -> None:
+    """Trains, puts the averaged weights into all policies and saves these."""
+    trained = next(name for name in policies if name != BACKBONE)
+    objectives = make_objectives(cfg, policies, trained)
+    logger, settings = make_logger(run, cfg), cfg["logger"]
+    planner = policies[trained].policy[-1]
+    torch.manual_seed(cfg["seed"])
+    train(
+        objectives,
+        window_sampler(data, cfg["network"]["horizon"], cfg["replay_buffer"]["batch_size"]),
+        cfg["optim"]["gradient_steps"],
+        Checkpointer(run.path / "checkpoints"),
+        save_interval=settings["save_interval"],
+        log_interval=settings["log_interval"],
+        log=logger,
+        meta={
+            "task": cfg["env"]["name"],
+            "normalizer": state_digest(planner.normalizer.state_dict()),
+            "network": cfg["network"],
+        },
+        resume=resume,
+        begun=run.metrics.rewind,
+        progress=settings["progress"],
+    )
+    for name in ("planner", BACKBONE):
+        loss = objectives[name].loss
+        loss.network_params.data.update_(loss.target_network_params.data)
+    share_weights(policies, trained)
+    for name, parts in policies.items():
+        about = {"task": cfg["env"]["name"], "env": cfg["env"], "seed": cfg["seed"]}
+        save_policy(
+            run.path / "policies" / name,
+            parts.policy,
+            {**about, **parts.description},
+            parts.database,
+        )
+
+
+def _whole_run(
+    run: RunFolder, cfg: dict[str, Any], make_objectives: MakeObjectives, resume: bool
+) -> None:
+    """From the data to the table."""
+    if cfg["device"].startswith("cuda") and not torch.cuda.is_available():
+        raise ValueError(f"device is {cfg['device']!r}, but torch sees no GPU; use device=cpu.")
+    torch.set_num_threads(cfg["threads"])
+    torch.manual_seed(cfg["seed"])  # fresh weights are the same when resumed
+    if cfg["loss"]["value"] not in ("recorded", "iql"):
+        raise ValueError(f"loss.value is {cfg['loss']['value']!r}; expected 'recorded' or 'iql'.")
+    print(f"run folder: {run.path}\ndata: {cfg['replay_buffer']['dataset']}", flush=True)
+    task, data = make_data(cfg)
+    print(check_data(task, data), flush=True)
+    policies = make_policies(cfg["network"], cfg["retrieval"], data)
+    for parts in policies.values():
+        parts.policy.to(cfg["device"])
+    for name, parts in policies.items():
+        if parts.database is not None:
+            total, kept = (len(t["episode"].unique()) for t in (data, parts.database[:]))
+            share = f"{kept} of {total} episodes ({kept / total:.1%})"
+            print(f"{name}: {share}, {len(parts.database)} rows", flush=True)
+    data = data.to(cfg["device"]) if cfg["device"] != "cpu" else data
+    if cfg["loss"]["value"] == "iql":
+        data["value"] = learn_value(run, cfg, data)
+    train_policies(run, cfg, policies, data, make_objectives, resume)
+    rows, episodes = evaluate_policies(run, cfg, task, policies, data)
+    plot_curves(run.metrics.rows(), run.path / "curves.png")
+    titles = {name: f"{name}: {rows[name]['score']:.0f}" for name in rows}
+    plain = {name: parts.policy for name, parts in policies.items()}
+    if isinstance(task, MazeTask):
+        plot_targets(task, episodes, plain, titles, run.path / "targets.png")
+    print(f"\n{format_table(rows)}\n\n{task.score_source}", flush=True)
+
+
+def run_recipe(
+    cfg: dict[str, Any], make_objectives: MakeObjectives, recipe: str = "dl_rad.py"
+) -> None:
+    """Runs a recipe; errors that a user can mend end in one line.
+
+    Args:
+        cfg (dict): the resolved config; with ``resume`` that of the run folder it names is taken.
+        make_objectives (callable): the losses of the recipe.
+        recipe (str, optional): its file, named where it says how to go on.
+    """
+    torchrl_logger.setLevel(logging.WARNING)
+    warnings.filterwarnings("ignore", "The name target_actor_network_params")  # of BCLoss
+    resume = cfg["resume"] is not None
+    try:
+        if resume:
+            run = RunFolder.open(cfg["resume"])
+            progress, cfg = cfg["logger"]["progress"], run.config()
+            cfg["logger"]["progress"] = progress
+        else:
+            resolve_dataset(cfg)
+            date = datetime.datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
+            folder = cfg["folder"] or f"outputs/{cfg['env']['name']}/{date}-seed{cfg['seed']}"
+            run = RunFolder.create(folder, cfg)
+        _whole_run(run, cfg, make_objectives, resume)
+    except KeyboardInterrupt as stop:
+        at = f" and saved at step {stop.args[0]}" if isinstance(stop, Interrupted) else ""
+        print(f"\nstopped{at}; go on with:", file=sys.stderr)
+        print(f"python recipes/{recipe} resume={run.path}", file=sys.stderr)
+        sys.exit(130)
+    except ERRORS as error:
+        sys.exit(f"error: {error.args[0] if isinstance(error, KeyError) else error}")
