@@ -27,19 +27,22 @@ def steps(count=60):
     return TensorDict({"observation": state, "action": action.tanh(), "next": following}, [count])
 
 
+OVER = steps()["next", "terminated"]
+
+
 def test_learned_once_for_a_run(tmp_path):
     run = RunFolder.create(tmp_path / "run", CONFIG)
-    value = learn_value(run, CONFIG, steps())
+    value = learn_value(run, CONFIG, steps(), OVER)
     assert value.shape == (60,) and value.dtype == torch.float32 and value.isfinite().all()
     written = (run.path / "value.csv").read_text()
     assert "value/loss_qvalue" in written
     torch.manual_seed(99)
-    assert torch.equal(learn_value(run, CONFIG, steps()), value)
+    assert torch.equal(learn_value(run, CONFIG, steps(), OVER), value)
     assert (run.path / "value.csv").read_text() == written
 
 
 def test_resumed_as_if_never_stopped(tmp_path, monkeypatch):
-    whole = learn_value(RunFolder.create(tmp_path / "whole", CONFIG), CONFIG, steps())
+    whole = learn_value(RunFolder.create(tmp_path / "whole", CONFIG), CONFIG, steps(), OVER)
     run = RunFolder.create(tmp_path / "run", CONFIG)
     from torchrl_rad.training import Objective
 
@@ -53,15 +56,15 @@ def test_resumed_as_if_never_stopped(tmp_path, monkeypatch):
 
     monkeypatch.setattr(Objective, "update", stop)
     with pytest.raises(KeyboardInterrupt):
-        learn_value(run, CONFIG, steps())
+        learn_value(run, CONFIG, steps(), OVER)
     monkeypatch.setattr(Objective, "update", update)
-    assert torch.equal(learn_value(run, CONFIG, steps()), whole)
+    assert torch.equal(learn_value(run, CONFIG, steps(), OVER), whole)
 
 
 def test_not_gone_on_with_under_other_settings(tmp_path):
     run = RunFolder.create(tmp_path / "run", CONFIG)
-    learn_value(run, CONFIG, steps())
+    learn_value(run, CONFIG, steps(), OVER)
     other = copy.deepcopy(CONFIG)
     other["loss"]["gamma"] = 0.5
     with pytest.raises(CheckpointError, match="gamma"):
-        learn_value(run, other, steps())
+        learn_value(run, other, steps(), OVER)

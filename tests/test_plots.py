@@ -19,6 +19,7 @@ from torchrl_rad.plots import (
     WALL,
     plot_curves,
     plot_followed,
+    plot_growth,
     plot_targets,
 )
 from torchrl_rad.policy import build_policy
@@ -229,6 +230,25 @@ def test_without_matplotlib(tmp_path, monkeypatch, backbone, draw):
 
 
 # what was followed
+
+
+def rounds(count, **last):
+    figures = {"demonstrations": 3, "scores": [1.0, 2.0, 4.0], "pruned": False}
+    made = [{**figures, "seen": 10 * number} for number in range(count)]
+    return [*made[:-1], {**made[-1], **last}]
+
+
+@pytest.mark.parametrize(
+    "runs",
+    [
+        {3: rounds(4)},
+        {3: rounds(4, pruned=True), 9: rounds(2)},
+        {1: rounds(1), 2: rounds(1, scores=[1.0])},
+    ],
+)
+def test_growth(tmp_path, runs):
+    plot_growth(runs, tmp_path / "growth.png")
+    assert (tmp_path / "growth.png").stat().st_size > 5000
 
 
 def test_followed_demonstrations(tmp_path):

@@ -20,7 +20,9 @@ __all__ = ["learn_value"]
 BATCH, LR, EMA = 256, 3e-4, 0.995  # as IQL's authors have them
 
 
-def learn_value(run: RunFolder, cfg: Mapping[str, Any], data: TensorDictBase) -> Tensor:
+def learn_value(
+    run: RunFolder, cfg: Mapping[str, Any], data: TensorDictBase, over: Tensor
+) -> Tensor:
     """V(s) of each recorded step, float32 [T], by implicit Q-learning.
 
     Args:
@@ -29,6 +31,7 @@ def learn_value(run: RunFolder, cfg: Mapping[str, Any], data: TensorDictBase) ->
         cfg (mapping): ``loss`` (``gamma``, ``expectile``, ``value_steps``), ``logger`` and
             ``seed``.
         data (TensorDictBase): flat steps [T].
+        over (Tensor): bool [T, 1], which of them end the task.
 
     Raises:
         CheckpointError: a checkpoint is damaged or of another run.
@@ -42,7 +45,8 @@ def learn_value(run: RunFolder, cfg: Mapping[str, Any], data: TensorDictBase) ->
         normalizer, data["action"].shape[-1], settings["gamma"], settings["expectile"]
     )
     objective = Objective(made, lambda batch: batch, lr=LR, steps=steps, weight_decay=0.0, ema=EMA)
-    kept = data.select("observation", "action", "next")
+    kept = data.select("observation", "action", "next").copy()
+    kept["next", "terminated"] = kept["next", "done"] = over
 
     def sample() -> TensorDictBase:
         return kept[torch.randint(len(kept), (BATCH,), device=kept.device)]

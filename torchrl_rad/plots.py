@@ -72,8 +72,8 @@ def plot_growth(runs: Mapping[int, Sequence[Mapping[str, Any]]], path: str | Pat
 
     Args:
         runs (mapping): demonstrations to begin with -> rounds, each ``seen``, episodes before it;
-            ``demonstrations``; and ``scores`` of its episodes, of which mean and 95 % interval are
-            drawn.
+            ``demonstrations``; ``pruned``, whether these are only some of those before; and
+            ``scores`` of its episodes, of which mean and 95 % interval are drawn.
         path (path): a png.
 
     Raises:
@@ -89,18 +89,30 @@ def plot_growth(runs: Mapping[int, Sequence[Mapping[str, Any]]], path: str | Pat
         axis.set(xlabel="demonstrations in the database", xscale="log")
     else:
         for number, (start, rounds) in enumerate(runs.items()):
-            seen = [entry["seen"] for entry in rounds]
-            centre, half = np.array([interval(entry["scores"]) for entry in rounds]).T
-            low, high = centre - half, centre + half
-            axis.fill_between(seen, low, high, color=f"C{number}", alpha=0.2, lw=0)
-            axis.plot(seen, centre, ".-", color=f"C{number}", label=f"from {start}")
+            _draw_growth(axis, start, rounds, f"C{number}")
         axis.set(xlabel="episodes seen")
-        axis.legend(title="demonstrations", frameon=False, fontsize=8)
+        axis.legend(frameon=False, fontsize=8, loc="lower center")
     axis.set(ylabel="score")
     axis.grid(alpha=0.3)
     figure.tight_layout()
     figure.savefig(path, dpi=130)
     pyplot.close(figure)
+
+
+def _draw_growth(axis: Any, start: int, rounds: Sequence[Mapping[str, Any]], colour: str) -> None:
+    grown = [entry for entry in rounds if not entry["pruned"]]
+    seen = [entry["seen"] for entry in grown]
+    centre, half = np.array([interval(entry["scores"]) for entry in grown]).T
+    low, high = centre - half, centre + half
+    axis.fill_between(seen, low, high, color=colour, alpha=0.2, lw=0)
+    axis.plot(seen, centre, ".-", color=colour, label=f"from {start} demonstrations")
+    for entry in rounds:
+        if entry["pruned"]:
+            centre, half = interval(entry["scores"])
+            label = f"pruned from {grown[-1]['demonstrations']} to {entry['demonstrations']}"
+            axis.errorbar(
+                entry["seen"], centre, half, fmt="x", color="black", capsize=3, label=label
+            )
 
 
 def plot_targets(

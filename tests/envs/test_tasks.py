@@ -172,7 +172,9 @@ def test_recorded_steps_are_paid_at_the_fixed_goal():
     following[1, :2] = torch.tensor(goal) + torch.tensor([0.49, 0.0])
     following[2, :2] = torch.tensor(goal) + torch.tensor([0.51, 0.0])
     steps = TensorDict({"next": {"observation": following, "reward": torch.ones(3, 1)}}, [3])
-    assert task.label(steps)["next", "reward"].squeeze(-1).tolist() == [0.0, 1.0, 0.0]
+    labelled = task.label(steps)
+    assert labelled["next", "reward"].squeeze(-1).tolist() == [0.0, 1.0, 0.0]
+    assert task.over(labelled).squeeze(-1).tolist() == [False, True, False]
 
 
 # the kitchen

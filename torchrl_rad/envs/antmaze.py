@@ -27,9 +27,9 @@ class AntMazeTask(Task):
     """gymnasium-robotics' AntMaze by D4RL's protocol: one goal cell, over when it is reached.
 
     The state is x, y and the 27 entries of the ant's body. The score is the share of episodes that
-    reach the goal. Recorded steps are rewarded, and terminated, where the next state lies within
-    0.5 of the centre of the goal cell; an episode goes on until it was cut. ``starts`` of
-    :meth:`make_env` are cells (row, column), which rows take in turn.
+    reach the goal. Recorded steps are rewarded where the next state lies within 0.5 of the centre
+    of the goal cell, though the recording goes on there. ``starts`` of :meth:`make_env` are cells
+    (row, column), which rows take in turn.
 
     Attributes:
         name: of the task.
@@ -64,10 +64,10 @@ class AntMazeTask(Task):
         return cell_centres(self.env_id, env.maze, cells)
 
     def label(self, steps: TensorDictBase) -> TensorDictBase:
-        labelled = relabel_goal(steps, self.cells([self.goal_cell])[0][0])
-        # the task is over there, though the recording went on
-        labelled["next", "terminated"] = labelled["next", "reward"] > 0
-        return labelled
+        return relabel_goal(steps, self.cells([self.goal_cell])[0][0])
+
+    def over(self, steps: TensorDictBase) -> Tensor:
+        return steps["next", "reward"] > 0
 
 
 class FixedGoalAntMaze(gym.Wrapper):

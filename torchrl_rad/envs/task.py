@@ -60,6 +60,12 @@ class Task(ABC):
         """Gives recorded steps [T] the rewards of this task; as they are unless it says else."""
         return steps
 
+    def over(self, steps: TensorDictBase) -> Tensor:
+        """Which of the labelled steps [T] end the task, bool [T, 1], whether or not the recording
+        goes on.
+        """
+        return steps["next", "terminated"]
+
     def normalised_score(self, episode_return: float | np.ndarray) -> Any:
         """Return of an episode on the scale of ``reference_scores``: 0 to 100."""
         low, high = self.reference_scores

@@ -138,7 +138,7 @@ def _whole_run(
             print(f"{name}: {share}, {len(parts.database)} rows", flush=True)
     data = data.to(cfg["device"]) if cfg["device"] != "cpu" else data
     if cfg["loss"]["value"] == "iql":
-        data["value"] = learn_value(run, cfg, data)
+        data["value"] = learn_value(run, cfg, data, task.over(data))
     train_policies(run, cfg, policies, data, make_objectives, resume)
     rows, episodes = evaluate_policies(run, cfg, task, policies, data)
     plot_curves(run.metrics.rows(), run.path / "curves.png")
