@@ -6,17 +6,24 @@ from torchrl_rad.modules.inverse import InverseDynamics, inverse_dynamics_actor
 from torchrl_rad.modules.levels import plan_levels
 from torchrl_rad.modules.normalizer import Normalizer
 from torchrl_rad.modules.placement import TargetPlacement
-from torchrl_rad.modules.process import Diffusion, RectifiedFlow, make_process
+from torchrl_rad.modules.process import (
+    AncestralDiffusion,
+    Diffusion,
+    RectifiedFlow,
+    make_process,
+)
 from torchrl_rad.modules.return_model import ReturnModel
-from torchrl_rad.modules.sampling import sample_plan
+from torchrl_rad.modules.sampling import Guidance, sample_plan
 from torchrl_rad.modules.step import StepEstimator
 from torchrl_rad.modules.target import RetrievalTargetModule
 from torchrl_rad.modules.target_variants import PlainTargetModule
 
 __all__ = [
+    "AncestralDiffusion",
     "DiT",
     "Diffusion",
     "DiffuserLitePlanner",
+    "Guidance",
     "InverseDynamics",
     "Normalizer",
     "PlainTargetModule",

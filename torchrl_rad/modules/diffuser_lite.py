@@ -3,22 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, Literal, NamedTuple
+from typing import Literal
 
 import torch
-from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModuleBase, dispatch
 from tensordict.utils import NestedKey
-from torch import Tensor, nn
-from torchrl.envs.utils import ExplorationType, exploration_type
+from torch import Tensor
 
 from torchrl_rad.data.database import ExpertDatabase
 from torchrl_rad.modules.dit import DiT
-from torchrl_rad.modules.frozen import FrozenCache, StepNetwork, is_hooked, step_network
+from torchrl_rad.modules.frozen import StepNetwork
 from torchrl_rad.modules.inverse import InverseDynamics
-from torchrl_rad.modules.levels import Level, plan_levels, plan_times
+from torchrl_rad.modules.levels import plan_levels, plan_times
 from torchrl_rad.modules.normalizer import Normalizer
 from torchrl_rad.modules.placement import TargetPlacement
+from torchrl_rad.modules.planner import Noise, Pin, Planner, PlanNetworks, Told, best_plans
 from torchrl_rad.modules.process import make_process
 from torchrl_rad.modules.return_model import ReturnModel
 from torchrl_rad.modules.sampling import sample_plan
@@ -26,33 +24,7 @@ from torchrl_rad.modules.sampling import sample_plan
 __all__ = ["DiffuserLitePlanner"]
 
 
-class Pin(NamedTuple):
-    """What one level is told of the target.
-
-    Attributes:
-        token: int64 [Q], grid point.
-        state: [Q, S], the state there, raw units.
-        active: bool [Q], whether it is pinned.
-    """
-
-    token: Tensor
-    state: Tensor
-    active: Tensor
-
-
-class PlanNetworks(nn.ModuleList):
-    """One network a level; called with the level's number."""
-
-    def forward(self, level: int, *args: Any, **kwargs: Any) -> Tensor:
-        return self[level](*args, **kwargs)
-
-    def reset_parameters_recursive(self) -> None:
-        """Draws new weights, as a TensorDictModule does."""
-        for network in self:
-            network.reset_parameters()  # type: ignore[operator]
-
-
-class DiffuserLitePlanner(TensorDictModuleBase):
+class DiffuserLitePlanner(Planner):
     """Plans states on ever finer grids and acts by inverse dynamics (DL-RAD).
 
     It is DiffuserLite (Dong et al., 2024) with a retrieved target.
@@ -82,7 +54,8 @@ class DiffuserLitePlanner(TensorDictModuleBase):
         horizon (int, optional): H, states of a plan at the finest step. Defaults to ``129``.
         jumps (sequence of int, optional): temporal jump of each level. Defaults to ``(32, 8, 1)``.
         width, heads, blocks (int, optional): of each level's DiT. Default to ``256``, ``8``, ``2``.
-        process (str, optional): ``"flow"`` or ``"diffusion"``. Defaults to ``"flow"``.
+        process (str, optional): ``"flow"``, ``"diffusion"`` or ``"ancestral"``, see
+            :func:`make_process`. Defaults to ``"flow"``.
         steps (int, optional): calls of the network a level. Defaults to ``3``.
         temperature (float, optional): scale of the initial noise. Defaults to ``1.0``.
         candidates (int, optional): first-level plans a row, of which the return model keeps the
@@ -124,78 +97,65 @@ class DiffuserLitePlanner(TensorDictModuleBase):
         width: int = 256,
         heads: int = 8,
         blocks: int = 2,
-        process: Literal["flow", "diffusion"] = "flow",
+        process: Literal["flow", "diffusion", "ancestral"] = "flow",
         steps: int = 3,
         temperature: float = 1.0,
         candidates: int = 1,
         return_model: ReturnModel | None = None,
-        noise: Literal["sample", "seeded", "zero"] = "sample",
+        noise: Noise = "sample",
         targets: bool = True,
         placement: str = "shifted",
         database: ExpertDatabase | None = None,
         in_keys: Sequence[NestedKey] | None = None,
         out_keys: Sequence[NestedKey] = ("plan", "action"),
     ):
-        super().__init__()
         levels = plan_levels(horizon, jumps)
-        _check(steps, temperature, candidates, return_model, noise, levels)
-        read = ["observation", "target", "found", "target_step", "target_index"]
-        self.in_keys = list(in_keys) if in_keys is not None else read if targets else read[:1]
-        self.out_keys = list(out_keys)
-        if len(self.in_keys) not in ((4, 5) if targets else (1,)) or len(self.out_keys) != 2:
+        super().__init__(
+            normalizer,
+            make_process(process),
+            steps,
+            temperature,
+            candidates,
+            return_model,
+            noise,
+            targets,
+            in_keys,
+            out_keys,
+        )
+        tokens = getattr(return_model, "tokens", levels[0].tokens)
+        if tokens != levels[0].tokens:
             raise ValueError(
-                f"in_keys are {self.in_keys} and out_keys {self.out_keys}; expected "
-                f"{'five' if targets else 'one'} and two, in the order of the table."
+                f"the return model sees {tokens} states; the first level of these plans has "
+                f"{levels[0].tokens}."
             )
-        self.levels, self.horizon, self.targets = levels, horizon, targets
-        self.process, self.steps, self.temperature = make_process(process), steps, temperature
-        self.candidates, self.noise = candidates, noise
+        self.levels, self.horizon = levels, horizon
         self.placement = TargetPlacement(placement)
         self.__dict__["database"] = database  # a handle, as in RetrievalTargetModule
-        self.normalizer, self.inverse_dynamics = normalizer, inverse_dynamics
-        self.return_model = return_model
+        self.inverse_dynamics = inverse_dynamics
         state_dim = len(normalizer.mean)
         self.networks = PlanNetworks(
             DiT(state_dim, level.tokens, width, heads, blocks) for level in self.levels
         )
         self.register_buffer("plan_times", plan_times(levels), persistent=False)
-        self._frozen = FrozenCache()
 
-    @dispatch(auto_batch_size=False)
-    @torch.no_grad()
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Writes plan and action into ``tensordict`` and returns it."""
-        observation = self.normalizer.read(tensordict, self.in_keys[0])
-        shape, width = observation.shape[:-1], observation.shape[-1]
-        state = torch.nan_to_num(observation, nan=0.0, posinf=0.0, neginf=0.0).reshape(-1, width)
-        pins = self._pins(tensordict, len(state)) if self.targets else [None] * len(self.levels)
-        plan = self.plan(state, pins)
+    def decide(self, state: Tensor, told: Told | None) -> tuple[Tensor, Tensor]:
+        plan = self.plan(state, self._pins(told))
         with torch.autocast(state.device.type, enabled=False):  # too small to be faster
-            action = self.inverse_dynamics(state, plan[:, 1])
-        tensordict.set(self.out_keys[0], plan.reshape(*shape, *plan.shape[1:]))
-        tensordict.set(self.out_keys[1], action.reshape(*shape, action.shape[-1]))
-        return tensordict
+            return plan, self.inverse_dynamics(state, plan[:, 1])
 
     # what is known
 
-    def _pins(self, tensordict: TensorDictBase, rows: int) -> list[Pin | None]:
-        target = self.normalizer.read(tensordict, self.in_keys[1])
-        target = target.reshape(rows, target.shape[-1])
-        found, step = (tensordict.get(key, None) for key in self.in_keys[2:4])
-        if found is None or step is None:
-            raise KeyError(
-                f"{self.in_keys[2 if found is None else 3]!r} is missing in the tensordict; a "
-                "planner with targets reads it."
-            )
-        found, step = found.reshape(rows), step.reshape(rows)
-        index = tensordict.get(self.in_keys[4], None) if len(self.in_keys) > 4 else None
+    def _pins(self, told: Told | None) -> list[Pin | None]:
         pins: list[Pin | None] = []
         for number, level in enumerate(self.levels):
-            place = self.placement(step, number, *level)
-            state = target
-            if index is not None:
-                state = self._recorded(target, index.reshape(rows), place.time - step)
-            pins.append(Pin(place.token, state, found & place.active))
+            if told is None:
+                pins.append(None)
+                continue
+            place = self.placement(told.step, number, *level)
+            state = told.target
+            if told.row is not None:
+                state = self._recorded(state, told.row, place.time - told.step)
+            pins.append(Pin(place.token, state, told.found & place.active))
         return pins
 
     def _recorded(self, target: Tensor, index: Tensor, shift: Tensor) -> Tensor:
@@ -213,24 +173,10 @@ class DiffuserLitePlanner(TensorDictModuleBase):
 
     # the plan
 
-    def _networks(self, device: torch.device) -> list[StepNetwork]:
-        """The networks of the levels at the sampler's times; under autocast in its precision."""
-        lower = torch.is_autocast_enabled(device.type)
-        dtype = torch.get_autocast_dtype(device.type) if lower else None
-        times = self.process.grid(self.steps)[:-1]
-
-        def make() -> list[StepNetwork]:
-            return [step_network(network, times, dtype) for network in self.networks]
-
-        if device.type != "cpu":
-            return make()  # nothing is packed there, and to compare weights would wait for it
-        hooked = tuple(map(is_hooked, self.networks))
-        return self._frozen.get(self.networks, (dtype, hooked, *times), make)
-
     def plan(self, state: Tensor, pins: Sequence[Pin | None]) -> Tensor:
         """Plans [Q, L, S] for raw states [Q, S]; ``pins`` holds a :class:`Pin` or None a level."""
-        seeded = torch.Generator(device=state.device).manual_seed(0) if self._is_seeded() else None
-        networks = self._networks(state.device)
+        seeded = self._generator(state.device)
+        networks = self._step_networks(state.device)
         end: Tensor | None = None
         finished: list[Tensor] = []
         with torch.autocast(state.device.type, enabled=False):
@@ -257,10 +203,7 @@ class DiffuserLitePlanner(TensorDictModuleBase):
         if end is not None:
             known[:, -1], mask[:, -1] = end, True
         if pin is not None:
-            here = torch.arange(tokens, device=state.device) == pin.token[:, None]  # [Q, n]
-            here &= pin.active[:, None]
-            known = torch.where(here[..., None], pin.state[:, None], known)
-            mask = mask | here[..., None]
+            known, mask = pin.write(known, mask)
         copies = self.candidates if number == 0 else 1
         many, many_mask = known.repeat_interleave(copies, 0), mask.repeat_interleave(copies, 0)
         given = network.prepare(many_mask)
@@ -273,56 +216,12 @@ class DiffuserLitePlanner(TensorDictModuleBase):
             many_mask,
             self.steps,
             free,
+            fresh=lambda: self._draw(len(state), copies, tokens, generator, state),
         )
         # exact in raw units: what is known is not sent through the normaliser and back
         raw = torch.where(many_mask, many, self.normalizer.inverse(sample))
-        return self._best(raw.unflatten(0, (len(state), copies))) if copies > 1 else raw
-
-    def _best(self, plans: Tensor) -> Tensor:
-        """The plan of each row that the return model prefers: [Q, C, n, S] -> [Q, n, S]."""
+        if copies == 1:
+            return raw
         assert self.return_model is not None
-        best = self.return_model(plans).argmax(-1)
-        return plans[torch.arange(len(plans), device=plans.device), best]
-
-    def _is_seeded(self) -> bool:
-        deterministic = exploration_type() == ExplorationType.DETERMINISTIC
-        return self.noise == "seeded" or (self.noise == "sample" and deterministic)
-
-    def _noise(
-        self, rows: int, copies: int, tokens: int, generator: torch.Generator | None, like: Tensor
-    ) -> Tensor:
-        shape = (rows * copies, tokens, like.shape[-1])
-        if self.noise == "zero":
-            return like.new_zeros(shape)
-        if generator is None:
-            return self.temperature * torch.randn(shape, device=like.device)
-        # one draw for every row, so that a row does not depend on those beside it
-        noise = torch.randn((copies, *shape[1:]), generator=generator, device=like.device)
-        return self.temperature * noise.repeat(rows, 1, 1)
-
-
-def _check(
-    steps: int,
-    temperature: float,
-    candidates: int,
-    return_model: nn.Module | None,
-    noise: str,
-    levels: Sequence[Level],
-) -> None:
-    """Raises ValueError for arguments of a planner that they cannot have."""
-    if steps < 1:
-        raise ValueError(f"steps is {steps}; a plan needs at least one inference step.")
-    if temperature < 0:
-        raise ValueError(f"temperature is {temperature}; it must not be negative.")
-    if candidates < 1 or (candidates > 1 and return_model is None):
-        raise ValueError(
-            f"candidates is {candidates}: expected 1, or more and a return_model to rank them."
-        )
-    tokens = getattr(return_model, "tokens", levels[0].tokens)
-    if tokens != levels[0].tokens:
-        raise ValueError(
-            f"the return model sees {tokens} states; the first level of these plans has "
-            f"{levels[0].tokens}."
-        )
-    if noise not in ("sample", "seeded", "zero"):
-        raise ValueError(f"noise is {noise!r}; expected 'sample', 'seeded' or 'zero'.")
+        plans = raw.unflatten(0, (len(state), copies))
+        return best_plans(plans, self.return_model(plans))

@@ -8,7 +8,7 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-__all__ = ["Diffusion", "Process", "RectifiedFlow", "make_process"]
+__all__ = ["AncestralDiffusion", "Diffusion", "Process", "RectifiedFlow", "make_process"]
 
 
 class Process(Protocol):
@@ -25,6 +25,9 @@ class Process(Protocol):
 
     def step(self, sample: Tensor, prediction: Tensor, time: float, following: float) -> Tensor:
         """From the sample at ``time`` to that at ``following``, given the network's prediction."""
+
+    def deviation(self, time: float, following: float) -> float:
+        """Of the fresh noise that is added after a step; 0 for none."""
 
 
 class RectifiedFlow:
@@ -53,6 +56,9 @@ class RectifiedFlow:
 
     def step(self, sample: Tensor, prediction: Tensor, time: float, following: float) -> Tensor:
         return torch.add(sample, prediction, alpha=time - following)
+
+    def deviation(self, time: float, following: float) -> float:
+        return 0.0
 
 
 class Diffusion:
@@ -104,14 +110,66 @@ class Diffusion:
         ratio = sigma_next / sigma
         return torch.add(ratio * sample, prediction, alpha=alpha_next - ratio * alpha)
 
+    def deviation(self, time: float, following: float) -> float:
+        return 0.0
+
+    def variance(self, time: float, following: float) -> float:
+        r"""Of the sample at ``following``, given that at ``time`` and the data.
+
+        .. math:: \tilde\beta = \frac{\sigma_s^2}{\sigma_t^2}
+            \left(1 - \frac{\alpha_t^2}{\alpha_s^2}\right)
+
+        It also scales the gradient of a return model (Janner et al., 2022).
+        """
+        (alpha, sigma), (alpha_next, sigma_next) = self._numbers(time), self._numbers(following)
+        return (sigma_next / sigma) ** 2 * (1 - (alpha / alpha_next) ** 2)
+
+
+class AncestralDiffusion(Diffusion):
+    r"""The same diffusion, sampled as DDPM does (Ho et al., 2020): fresh noise after each step.
+
+    A step leads to the mean of the posterior (equation "sample2" of RAD, whose printed fraction is
+    corrected here), and noise of the variance :math:`\tilde\beta` is added; none after the last
+    step, which returns the prediction itself:
+
+    .. math:: \mu = \frac{\alpha_s \beta}{\sigma_t^2} \hat\tau^0
+        + \frac{\alpha_t \sigma_s^2}{\alpha_s \sigma_t^2} \hat\tau^t,
+        \quad \beta = 1 - \frac{\alpha_t^2}{\alpha_s^2}
+
+    from time t to time s. In K steps these are DDPM's K noise levels; a network that was trained at
+    all times can be sampled with any K.
+
+    Examples:
+        >>> process, clean = AncestralDiffusion(), torch.tensor([2.0])
+        >>> alpha, following = process.alpha_sigma(0.8)[0], process.alpha_sigma(0.6)[0]
+        >>> mean = process.step(alpha * clean, clean, 0.8, 0.6)
+        >>> torch.allclose(mean, following * clean)
+        True
+    """
+
+    def step(self, sample: Tensor, prediction: Tensor, time: float, following: float) -> Tensor:
+        if following == 0.0:
+            return prediction
+        (alpha, sigma), (alpha_next, sigma_next) = self._numbers(time), self._numbers(following)
+        kept = alpha / alpha_next
+        of_data = alpha_next * (1 - kept**2) / sigma**2
+        return torch.add(kept * (sigma_next / sigma) ** 2 * sample, prediction, alpha=of_data)
+
+    def deviation(self, time: float, following: float) -> float:
+        return math.sqrt(self.variance(time, following))
+
 
 def make_process(name: str) -> Process:
-    """``"flow"`` or ``"diffusion"`` by name.
+    """A process by name: ``"flow"``, ``"diffusion"`` (sampled by DDIM) or ``"ancestral"`` (DDPM).
 
     Raises:
         ValueError: another name.
     """
-    processes: dict[str, type[Process]] = {"flow": RectifiedFlow, "diffusion": Diffusion}
+    processes: dict[str, type[Process]] = {
+        "ancestral": AncestralDiffusion,
+        "diffusion": Diffusion,
+        "flow": RectifiedFlow,
+    }
     if name not in processes:
         raise ValueError(f"process is {name!r}; expected one of {sorted(processes)}.")
     return processes[name]()

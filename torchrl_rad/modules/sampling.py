@@ -2,15 +2,30 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from itertools import pairwise
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from torchrl_rad.modules.process import Process
 
-__all__ = ["inpaint", "sample_plan"]
+__all__ = ["Guidance", "inpaint", "sample_plan"]
+
+
+class Guidance(NamedTuple):
+    """How samples are led to a larger value before each call of the network.
+
+    Attributes:
+        gradient: (sample [B, L, D], number of the step) -> gradient of the value [B, L, D].
+        scales: factor of the gradient, one a step; where it is 0, none is taken.
+        repeats: gradients a step.
+    """
+
+    gradient: Callable[[Tensor, int], Tensor]
+    scales: Sequence[float]
+    repeats: int
 
 
 def inpaint(values: Tensor, known: Tensor, mask: Tensor) -> Tensor:
@@ -26,11 +41,13 @@ def sample_plan(
     mask: Tensor,
     steps: int,
     free: slice = slice(None),
+    guidance: Guidance | None = None,
+    fresh: Callable[[], Tensor] | None = None,
 ) -> Tensor:
     """Turns noise into plans that hold the known entries.
 
     The known entries are written before each call of the network and at the end (RAD, section
-    "Planning Module").
+    "Planning Module"). Guidance moves the sample that the network then sees (Janner et al., 2022).
 
     Args:
         process (Process): the generative process.
@@ -43,6 +60,9 @@ def sample_plan(
         steps (int): calls of the network.
         free (slice, optional): f tokens next to each other that are to be predicted; the others are
             known. Defaults to all.
+        guidance (Guidance, optional): towards plans of a larger value. Defaults to none.
+        fresh (callable, optional): () -> noise [B, L, D] for a process that adds some after a step.
+            Defaults to standard normal noise.
 
     Returns:
         Plans, [B, L, D].
@@ -62,10 +82,18 @@ def sample_plan(
         raise ValueError(f"steps is {steps}; a plan needs at least one inference step.")
     sample = inpaint(noise, known, mask)
     begin, end, _ = free.indices(sample.shape[1])
-    part, known, mask = sample[:, begin:end], known[:, begin:end], mask[:, begin:end]
+    part_known, part_mask = known[:, begin:end], mask[:, begin:end]
     before, after = sample[:, :begin], sample[:, end:]
     for step, (time, following) in enumerate(pairwise(process.grid(steps))):
-        prediction = network(sample, step)
-        part = inpaint(process.step(part, prediction, time, following), known, mask)
-        sample = torch.cat([before, part, after], 1)
+        if guidance is not None and guidance.scales[step]:
+            for _ in range(guidance.repeats):
+                shift = guidance.gradient(sample, step)
+                shifted = torch.add(sample, shift, alpha=guidance.scales[step])
+                sample = inpaint(shifted, known, mask)
+        part = process.step(sample[:, begin:end], network(sample, step), time, following)
+        deviation = process.deviation(time, following)
+        if deviation:
+            noise = torch.randn_like(sample) if fresh is None else fresh()
+            part = torch.add(part, noise[:, begin:end], alpha=deviation)
+        sample = torch.cat([before, inpaint(part, part_known, part_mask), after], 1)
     return sample

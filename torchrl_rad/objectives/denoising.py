@@ -11,7 +11,8 @@ from tensordict.nn import dispatch
 from tensordict.utils import NestedKey
 from torch import Tensor
 
-from torchrl_rad.modules.diffuser_lite import DiffuserLitePlanner, PlanNetworks
+from torchrl_rad.modules.diffuser_lite import DiffuserLitePlanner
+from torchrl_rad.modules.planner import PlanNetworks
 from torchrl_rad.objectives.common import KeyedLoss, window_masks
 
 __all__ = ["DenoisingLoss"]
