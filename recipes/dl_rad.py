@@ -18,11 +18,9 @@ from torchrl_rad import (
     DenoisingLoss,
     Objective,
     ReturnGuidanceLoss,
-    StepEstimationLoss,
-    draw_step_pairs,
     inverse_dynamics_actor,
 )
-from torchrl_rad.experiment import BACKBONE, PolicyParts, run_recipe
+from torchrl_rad.experiment import BACKBONE, PolicyParts, run_recipe, step_objective
 from torchrl_rad.precision import uses_bf16
 
 
@@ -51,14 +49,7 @@ def make_objectives(
     objectives = {
         "planner": denoising(planner),
         BACKBONE: denoising(backbone),
-        "estimator": Objective(
-            StepEstimationLoss(estimator),
-            lambda windows: draw_step_pairs(
-                windows["observation"], horizon=estimator.horizon, pairs=loss["step_pairs"]
-            ),
-            steps=steps,
-            **head,
-        ),
+        "estimator": step_objective(cfg, estimator),
         "inverse": Objective(
             BCLoss(inverse_dynamics_actor(planner.inverse_dynamics), loss_function="l2"),
             lambda windows: windows[:, :8].reshape(-1),  # enough of them; all would cost more
@@ -79,7 +70,9 @@ def make_objectives(
 @hydra.main(config_path="config", config_name="dl_rad", version_base="1.3")
 def main(config: DictConfig) -> None:
     """Reads the command line."""
-    run_recipe(OmegaConf.to_container(config, resolve=True), make_objectives)
+    cfg = OmegaConf.to_container(config, resolve=True)
+    cfg.pop("diffuser", None)  # of the other recipe
+    run_recipe(cfg, make_objectives)
 
 
 if __name__ == "__main__":

@@ -22,9 +22,12 @@ from torchrl_rad.checkpoint import (
     write_json,
 )
 from torchrl_rad.data.database import ExpertDatabase
+from torchrl_rad.modules.diffuser import DiffuserPlanner
 from torchrl_rad.modules.diffuser_lite import DiffuserLitePlanner
 from torchrl_rad.modules.inverse import InverseDynamics
+from torchrl_rad.modules.noisy_return_model import NoisyReturnModel
 from torchrl_rad.modules.normalizer import Normalizer
+from torchrl_rad.modules.planner import Planner
 from torchrl_rad.modules.return_model import ReturnModel
 from torchrl_rad.modules.step import StepEstimator
 from torchrl_rad.modules.target import OUT_KEYS, RetrievalTargetModule
@@ -34,7 +37,8 @@ from torchrl_rad.retrieval.goals import GoalReward
 __all__ = ["build_policy", "fit_scales", "load_policy", "save_policy", "with_goals"]
 
 FORMAT = 1
-PLANNER = {"horizon": 129, "jumps": (32, 8, 1), "candidates": 1}  # of DiffuserLitePlanner
+LITE = "diffuser_lite"
+HORIZONS = {LITE: 129, "diffuser": 32}
 
 
 def build_policy(
@@ -44,7 +48,8 @@ def build_policy(
 
     Args:
         description (dict): ``state_dim``, ``action_dim`` and ``action_bound`` (1.0 if left out);
-            ``planner``, ``estimator`` and ``target``: arguments of :class:`DiffuserLitePlanner`,
+            ``planner``, ``estimator`` and ``target``: arguments of :class:`DiffuserLitePlanner` (of
+            :class:`DiffuserPlanner` if its ``kind`` is ``"diffuser"``, with ``guide_width``),
             :class:`StepEstimator` and :class:`RetrievalTargetModule`, a ``goal_reward`` as those of
             :class:`GoalReward`; the rules ``"random"``, ``"nearest"`` and ``"none"`` are those of
             :class:`PlainTargetModule`. The horizon of ``"target"`` holds for the estimator too; it
@@ -62,9 +67,9 @@ def build_policy(
         (['observation'], ['plan', 'action'])
     """
     width, target = description["state_dim"], description.get("target")
-    planner_options = {**PLANNER, **description["planner"]}
+    planner_options = dict(description["planner"])
+    horizon = planner_options.get("horizon", HORIZONS[planner_options.get("kind", LITE)])
     estimator_options = dict(description.get("estimator") or {})
-    horizon = planner_options["horizon"]
     reach = (target or {}).get("horizon", horizon)
     if reach > horizon:
         raise ValueError(
@@ -77,15 +82,9 @@ def build_policy(
             f"the horizon of 'estimator' is {other}, but that of 'target' is {reach}; "
             "leave it out, so that the target's holds."
         )
-    states, difference = Normalizer.identity(width), Normalizer.identity(width)
-    bound = description.get("action_bound", 1.0)
-    inverse = InverseDynamics(states, difference, description["action_dim"], bound=bound)
-    if planner_options["candidates"] > 1:
-        tokens = (horizon - 1) // planner_options["jumps"][0] + 1
-        planner_options["return_model"] = ReturnModel(states, tokens)
-    planner = DiffuserLitePlanner(
-        states, inverse, targets=target is not None, database=database, **planner_options
-    )
+    states = Normalizer.identity(width)
+    make = _lite_planner if planner_options.pop("kind", LITE) == LITE else _diffuser
+    planner = make(description, states, horizon, planner_options, database)
     if target is None:
         return TensorDictSequential(planner)
     if database is None:
@@ -93,6 +92,30 @@ def build_policy(
     select = _select(database, {**target, "horizon": reach})
     estimator = StepEstimator(states, **{**estimator_options, "horizon": reach})
     return TensorDictSequential(select, estimator, planner)
+
+
+def _lite_planner(description, states, horizon, options, database) -> Planner:
+    difference, bound = Normalizer.identity(len(states.mean)), description.get("action_bound", 1.0)
+    inverse = InverseDynamics(states, difference, description["action_dim"], bound=bound)
+    if options.get("candidates", 1) > 1:
+        jump = options.get("jumps", (32,))[0]
+        options["return_model"] = ReturnModel(states, (horizon - 1) // jump + 1)
+    targets = description.get("target") is not None
+    return DiffuserLitePlanner(states, inverse, targets=targets, database=database, **options)
+
+
+def _diffuser(description, states, horizon, options, database) -> Planner:
+    guide = options.pop("guide_width", 16)
+    if options.get("candidates", 1) > 1:
+        sizes = (description["action_dim"], horizon, guide, options.get("multiples", (1, 2, 4, 8)))
+        options["return_model"] = NoisyReturnModel(states, *sizes)
+    return DiffuserPlanner(
+        states,
+        description["action_dim"],
+        targets=description.get("target") is not None,
+        bound=description.get("action_bound", 1.0),
+        **options,
+    )
 
 
 def _select(database: ExpertDatabase, options: dict[str, Any]) -> TensorDictModuleBase:
@@ -140,6 +163,8 @@ def with_goals(
     )
     planner = copy.copy(planner)
     planner.__dict__["database"], planner.candidates = database, 1
+    if isinstance(planner, DiffuserPlanner):
+        planner.guide_scale = 0.0
     return TensorDictSequential(select, estimator, planner)
 
 
@@ -157,8 +182,9 @@ def fit_scales(policy: TensorDictSequential, data: TensorDictBase) -> None:
     planner = policy[-1]
     now, following = data["observation"], data["next", "observation"]
     planner.normalizer.load_state_dict(_scale(now, planner.normalizer))
-    change = planner.inverse_dynamics.difference
-    change.load_state_dict(_scale(following - now, change))
+    if isinstance(planner, DiffuserLitePlanner):
+        change = planner.inverse_dynamics.difference
+        change.load_state_dict(_scale(following - now, change))
     if planner.return_model is not None:
         planner.return_model.fit_scale(data["return_to_go"])
 

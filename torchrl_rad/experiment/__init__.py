@@ -21,6 +21,7 @@ from torchrl_rad.experiment.recipe import (
     MakeObjectives,
     make_logger,
     run_recipe,
+    step_objective,
     train_policies,
 )
 from torchrl_rad.experiment.scoring import (
@@ -51,6 +52,7 @@ __all__ = [
     "saved_task",
     "share_weights",
     "step_error",
+    "step_objective",
     "task_dataset",
     "train_policies",
     "window_sampler",

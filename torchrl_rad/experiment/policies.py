@@ -17,6 +17,7 @@ from torchrl_rad.data.experts import expert_from_config
 from torchrl_rad.envs.maze import MazeTask
 from torchrl_rad.envs.task import Task
 from torchrl_rad.envs.tasks import make_task
+from torchrl_rad.modules.diffuser_lite import DiffuserLitePlanner
 from torchrl_rad.policy import build_policy, fit_scales
 from torchrl_rad.retrieval import RetrievalSampler
 
@@ -111,7 +112,8 @@ def share_weights(policies: Mapping[str, PolicyParts], trained: str) -> None:
     for name, parts in policies.items():
         if name == BACKBONE:
             own, given = parts.policy[-1], source[-1]
-            own.inverse_dynamics.load_state_dict(given.inverse_dynamics.state_dict())
+            if isinstance(own, DiffuserLitePlanner):
+                own.inverse_dynamics.load_state_dict(given.inverse_dynamics.state_dict())
             if own.return_model is not None:
                 own.return_model.load_state_dict(given.return_model.state_dict())
         elif name != trained:

@@ -20,6 +20,8 @@ from torchrl_rad.experiment.data import check_data, make_data, resolve_dataset, 
 from torchrl_rad.experiment.policies import BACKBONE, PolicyParts, make_policies, share_weights
 from torchrl_rad.experiment.scoring import evaluate_policies
 from torchrl_rad.learned_value import learn_value
+from torchrl_rad.modules.step import StepEstimator
+from torchrl_rad.objectives.step import StepEstimationLoss, draw_step_pairs
 from torchrl_rad.plots import plot_curves, plot_targets
 from torchrl_rad.policy import save_policy
 from torchrl_rad.results import format_table
@@ -30,6 +32,7 @@ __all__ = [
     "MakeObjectives",
     "make_logger",
     "run_recipe",
+    "step_objective",
     "train_policies",
 ]
 
@@ -68,6 +71,20 @@ def make_logger(run: RunFolder, cfg: Mapping[str, Any]) -> Callable[[int, dict[s
             other.log_metrics(values, step=step)
 
     return log
+
+
+def step_objective(cfg: Mapping[str, Any], estimator: StepEstimator) -> Objective:
+    """L_e, on several pairs of states of each window."""
+    optim, pairs = cfg["optim"], cfg["loss"]["step_pairs"]
+    return Objective(
+        StepEstimationLoss(estimator),
+        lambda windows: draw_step_pairs(
+            windows["observation"], horizon=estimator.horizon, pairs=pairs
+        ),
+        lr=optim["head_lr"],
+        steps=optim["gradient_steps"],
+        warmup=optim["warmup"],
+    )
 
 
 def train_policies(

@@ -29,7 +29,13 @@ __all__ = [
     "step_error",
 ]
 
-PARTS = {"TS": "RetrievalTargetModule", "SE": "StepEstimator", "PL": "DiffuserLitePlanner"}
+PARTS = {  # what stands in their columns
+    "RetrievalTargetModule": "TS",
+    "PlainTargetModule": "TS",
+    "StepEstimator": "SE",
+    "DiffuserLitePlanner": "PL",
+    "DiffuserPlanner": "PL",
+}
 
 
 def collect_episodes(
@@ -150,7 +156,7 @@ def policy_row(task: Task, policy: TensorDictSequential, steps: TensorDictBase) 
         latency[str(count)] = measure_latency(policy, steps["observation"], count, goals=goals)
     torch.set_num_threads(threads)
     row["latency_ms"] = latency
-    for part, module in PARTS.items():
+    for module, part in PARTS.items():
         if module in latency["1"]:
             row[part] = "{p50:.1f} / {p95:.1f}".format(**latency["1"][module])
     return row

@@ -274,7 +274,7 @@ class FrozenCache:
         same = state == self.state
         if not same:
             self.state = state
-            self.samples = [p.detach().flatten() if p.ndim < 2 else p[0] for p in parameters]
+            self.samples = [(p if p.ndim < 2 else p[0]).detach().flatten() for p in parameters]
         sample = torch.cat(self.samples) if self.samples else torch.empty(0)
         if not same or not torch.equal(sample, self.before):
             self.before, self.made = sample, {}

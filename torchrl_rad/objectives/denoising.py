@@ -11,8 +11,7 @@ from tensordict.nn import dispatch
 from tensordict.utils import NestedKey
 from torch import Tensor
 
-from torchrl_rad.modules.diffuser_lite import DiffuserLitePlanner
-from torchrl_rad.modules.planner import PlanNetworks
+from torchrl_rad.modules.planner import Planner, PlanNetworks
 from torchrl_rad.objectives.common import KeyedLoss, window_masks
 
 __all__ = ["DenoisingLoss"]
@@ -35,7 +34,7 @@ class DenoisingLoss(KeyedLoss):
     the weight of the state after the current one, which is what a plan is used for.
 
     Args:
-        planner (DiffuserLitePlanner): whose networks are trained.
+        planner (Planner): whose networks are trained.
 
     Keyword Args:
         no_target (float, optional): share of pieces without a target; a planner with
@@ -54,7 +53,7 @@ class DenoisingLoss(KeyedLoss):
         "mask")``, ...) may be [*B] or [*B, H]: a window counts if all its steps do.
 
     Examples:
-        >>> from torchrl_rad import InverseDynamics, Normalizer
+        >>> from torchrl_rad import DiffuserLitePlanner, InverseDynamics, Normalizer
         >>> states = Normalizer.identity(2)
         >>> inverse = InverseDynamics(states, states, 1)
         >>> planner = DiffuserLitePlanner(states, inverse, horizon=9, jumps=(4, 1), width=32)
@@ -82,7 +81,7 @@ class DenoisingLoss(KeyedLoss):
 
     def __init__(
         self,
-        planner: DiffuserLitePlanner,
+        planner: Planner,
         *,
         no_target: float = 0.2,
         pseudo_step: int | None = None,
@@ -117,6 +116,19 @@ class DenoisingLoss(KeyedLoss):
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Loss of a batch of windows, and the mean of each level."""
+        windows, masks, shape = self._read(tensordict)
+        with self.network_params.to_module(self.network):
+            levels = range(len(self.levels))
+            losses = [self._level(number, windows).reshape(shape) for number in levels]
+        out = {"loss_denoising": self._reduce_loss(torch.stack(losses).sum(0), masks)}
+        for number, value in enumerate(losses):
+            out[f"level_{number}"] = self._reduce_loss(value.detach(), masks, reduction="mean")
+        out = TensorDict(out)
+        self._clear_weakrefs(tensordict, out, "network_params", "target_network_params")
+        return out
+
+    def _read(self, tensordict: TensorDictBase) -> tuple[Tensor, TensorDict, torch.Size]:
+        """Standardised windows [B, H, S], masks for the reduction, and the shape [*B]."""
         windows = self.planner_normalizer.read(tensordict, self.tensor_keys.observation)
         if windows.ndim < 2 or windows.shape[-2] != self.horizon:
             raise ValueError(
@@ -128,15 +140,7 @@ class DenoisingLoss(KeyedLoss):
         if counted is not None:  # what is masked may be NaN, also in the backward pass
             windows = torch.where(counted[..., None, None], windows, 0.0)
         windows = self.planner_normalizer(windows.reshape(-1, *windows.shape[-2:]))
-        with self.network_params.to_module(self.network):
-            levels = range(len(self.levels))
-            losses = [self._level(number, windows).reshape(shape) for number in levels]
-        out = {"loss_denoising": self._reduce_loss(torch.stack(losses).sum(0), masks)}
-        for number, value in enumerate(losses):
-            out[f"level_{number}"] = self._reduce_loss(value.detach(), masks, reduction="mean")
-        out = TensorDict(out)
-        self._clear_weakrefs(tensordict, out, "network_params", "target_network_params")
-        return out
+        return windows, masks, shape
 
     def _level(self, number: int, windows: Tensor) -> Tensor:
         """Loss of each window [B] on one level."""

@@ -1,0 +1,59 @@
+"""D-RAD: trains, compares with its backbone, prints a table.
+
+python recipes/d_rad.py task=hopper-medium-replay seed=1
+python recipes/d_rad.py --multirun seed=0,1,2
+python recipes/d_rad.py resume=outputs/pointmaze-umaze/<run>
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import hydra
+from omegaconf import DictConfig, OmegaConf
+
+from torchrl_rad import NoisyReturnLoss, Objective, TrajectoryLoss
+from torchrl_rad.experiment import BACKBONE, PolicyParts, run_recipe, step_objective
+from torchrl_rad.precision import uses_bf16
+
+
+def make_objectives(
+    cfg: dict[str, Any], policies: Mapping[str, PolicyParts], trained: str
+) -> dict[str, Objective]:
+    """L_d, L_e and L_g; L_d again for the backbone."""
+    planner, backbone = (policies[name].policy[-1] for name in (trained, BACKBONE))
+    optim, loss, steps = cfg["optim"], cfg["loss"], cfg["optim"]["gradient_steps"]
+    shared = {"no_target": loss["no_target"]}
+
+    def denoising(planner) -> Objective:
+        options = {"pseudo_step": loss["pseudo_step"], "action_weight": loss["next_weight"]}
+        module = TrajectoryLoss(planner, delay=True, **shared, **options)
+        rates = {name: optim[name] for name in ("lr", "warmup", "weight_decay", "ema")}
+        bf16 = uses_bf16(optim["precision"], cfg["device"])
+        return Objective(module, lambda windows: windows, steps=steps, bf16=bf16, **rates)
+
+    objectives = {
+        "planner": denoising(planner),
+        BACKBONE: denoising(backbone),
+        "estimator": step_objective(cfg, policies[trained].policy[1]),
+    }
+    if planner.return_model is not None:
+        module = NoisyReturnLoss(planner, gamma=loss["gamma"], **shared)
+        if loss["value"] == "iql":
+            module.set_keys(value="value")
+        options = {"lr": optim["lr"], "warmup": optim["warmup"]}
+        objectives["return"] = Objective(module, lambda windows: windows, steps=steps, **options)
+    return objectives
+
+
+@hydra.main(config_path="config", config_name="d_rad", version_base="1.3")
+def main(config: DictConfig) -> None:
+    """Reads the command line."""
+    cfg = OmegaConf.to_container(config, resolve=True)
+    cfg["network"] = cfg.pop("diffuser")
+    run_recipe(cfg, make_objectives, "d_rad.py")
+
+
+if __name__ == "__main__":
+    main()

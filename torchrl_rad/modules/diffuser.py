@@ -1,0 +1,216 @@
+"""PL of D-RAD: a plan of states and actions around the current state and the target."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import Literal
+
+import torch
+from tensordict.utils import NestedKey
+from torch import Tensor
+
+from torchrl_rad.modules.levels import Level
+from torchrl_rad.modules.noisy_return_model import NoisyReturnModel
+from torchrl_rad.modules.normalizer import Normalizer
+from torchrl_rad.modules.placement import TargetPlacement
+from torchrl_rad.modules.planner import Noise, Pin, Planner, PlanNetworks, Told, best_plans
+from torchrl_rad.modules.process import Diffusion, make_process
+from torchrl_rad.modules.sampling import Guidance, sample_plan
+from torchrl_rad.modules.temporal_unet import TemporalUNet, check_length
+
+__all__ = ["DiffuserPlanner"]
+
+SAMPLERS = {"ancestral": "ancestral", "ddim": "diffusion"}  # names of their processes
+
+
+class DiffuserPlanner(Planner):
+    """Plans states and actions together, step by step, and acts by the first one (D-RAD).
+
+    It is Diffuser (Janner et al., 2022) with a retrieved target: the state ``target_step`` steps
+    ahead. The current state and the target are in-painted: they are in ``plan`` exactly; all
+    actions are free. Rows with ``found`` False, or with a target beyond the horizon, are planned
+    without a target in the same batch; a step below 1 counts as 1.
+
+    Before each call of the network the return model moves the noisy plans towards a larger return;
+    in the end it chooses among the candidates.
+
+    ================  ====================  ====================================================
+    key               shape, dtype          meaning
+    ================  ====================  ====================================================
+    ``observation``   [*B, S], read         state, raw units; NaN and Inf count as 0
+    ``target``        [*B, S], read         target, raw units
+    ``found``         [*B, 1] bool, read    whether there is a target
+    ``target_step``   [*B, 1] int64, read   steps to the target, 1 to H - 1
+    ``target_index``  [*B, 1] int64         may be missing: every step has its place in a plan, so
+                                            that no other row is looked up
+    ``plan``          [*B, H, S] float32    planned states, raw units, at ``plan_times``
+                                            (int64 [H]) steps from now
+    ``action``        [*B, A] float32       action
+    ================  ====================  ====================================================
+
+    Args:
+        normalizer (Normalizer): of states; actions are planned as they are.
+        action_dim (int): A.
+        horizon (int, optional): H, steps of a plan, a multiple of 2 ** (resolutions - 1). Defaults
+            to ``32``.
+        width, multiples (optional): of the :class:`TemporalUNet`. Default to ``32``,
+            ``(1, 2, 4, 8)``.
+        steps (int, optional): calls of the network. Defaults to ``20``.
+        sampler (str, optional): ``"ancestral"`` (DDPM), or ``"ddim"``, which does with few steps;
+            both sample from the same weights. Defaults to ``"ancestral"``.
+        temperature (float, optional): scale of the initial noise. Defaults to ``1.0``.
+        candidates (int, optional): plans a row, of which the return model keeps the best. Defaults
+            to ``1``.
+        return_model (NoisyReturnModel, optional): J; needed for more than one candidate.
+        guide_scale (float, optional): times the posterior variance it is the factor of J's
+            gradient, J in units of its deviation; 0 for none. Defaults to ``1.0``.
+        guide_steps (int, optional): gradients before a call of the network. Defaults to ``2``.
+        guide_stop (int, optional): last steps that are not guided. Defaults to ``2``.
+        noise (str, optional): ``"sample"``; ``"seeded"``: the same noise at each call and for each
+            row, also used when ``"sample"`` meets ``ExplorationType.DETERMINISTIC``; ``"zero"``.
+            Defaults to ``"sample"``.
+        targets (bool, optional): False gives the backbone, which reads the observation alone.
+            Defaults to ``True``.
+        bound (float, optional): actions lie in [-bound, bound]. Defaults to ``1.0``.
+        in_keys, out_keys (sequence of NestedKey, optional): new names, in the order of the table.
+
+    Raises:
+        ValueError: an argument has a value that it cannot have.
+
+    Examples:
+        >>> from tensordict import TensorDict
+        >>> planner = DiffuserPlanner(Normalizer.identity(2), 1, horizon=8, width=8, steps=2)
+        >>> out = planner(TensorDict({"observation": torch.zeros(3, 2), "target": torch.ones(3, 2),
+        ...     "found": torch.ones(3, 1, dtype=torch.bool), "target_step": torch.full((3, 1), 5)},
+        ...     [3]))
+        >>> out["action"].shape, out["plan"].shape, out["plan"][0, 5].tolist()
+        (torch.Size([3, 1]), torch.Size([3, 8, 2]), [1.0, 1.0])
+    """
+
+    plan_times: Tensor
+    return_model: NoisyReturnModel | None
+
+    def __init__(
+        self,
+        normalizer: Normalizer,
+        action_dim: int,
+        horizon: int = 32,
+        width: int = 32,
+        multiples: Sequence[int] = (1, 2, 4, 8),
+        steps: int = 20,
+        sampler: Literal["ancestral", "ddim"] = "ancestral",
+        temperature: float = 1.0,
+        candidates: int = 1,
+        return_model: NoisyReturnModel | None = None,
+        guide_scale: float = 1.0,
+        guide_steps: int = 2,
+        guide_stop: int = 2,
+        noise: Noise = "sample",
+        targets: bool = True,
+        bound: float = 1.0,
+        in_keys: Sequence[NestedKey] | None = None,
+        out_keys: Sequence[NestedKey] = ("plan", "action"),
+    ):
+        if sampler not in SAMPLERS:
+            raise ValueError(f"sampler is {sampler!r}; expected one of {sorted(SAMPLERS)}.")
+        super().__init__(
+            normalizer,
+            make_process(SAMPLERS[sampler]),
+            steps,
+            temperature,
+            candidates,
+            return_model,
+            noise,
+            targets,
+            in_keys,
+            out_keys,
+        )
+        if guide_scale < 0 or guide_steps < 0 or guide_stop < 0:
+            raise ValueError(
+                f"guide_scale, guide_steps and guide_stop are {guide_scale}, {guide_steps} and "
+                f"{guide_stop}; none may be negative."
+            )
+        check_length(horizon, len(multiples))
+        state_dim = len(normalizer.mean)
+        seen = (
+            getattr(return_model, "horizon", horizon),
+            getattr(return_model, "entries", state_dim + action_dim),
+        )
+        if seen != (horizon, state_dim + action_dim):
+            raise ValueError(
+                f"the return model sees {seen[0]} steps of {seen[1]} entries; these plans have "
+                f"{horizon} of {state_dim + action_dim}."
+            )
+        self.action_dim, self.bound = action_dim, bound
+        self.horizon, self.levels = horizon, [Level(1, horizon)]
+        self.guide_scale, self.guide_steps, self.guide_stop = guide_scale, guide_steps, guide_stop
+        self.placement = TargetPlacement("shifted")  # on this grid all placements are alike
+        self.networks = PlanNetworks([TemporalUNet(state_dim + action_dim, width, multiples)])
+        self.register_buffer("plan_times", torch.arange(horizon), persistent=False)
+
+    def decide(self, state: Tensor, told: Told | None) -> tuple[Tensor, Tensor]:
+        pin = None
+        if told is not None:
+            place = self.placement(told.step, 0, *self.levels[0])
+            pin = Pin(place.token, told.target, told.found & place.active)
+        plan, width = self.plan(state, pin), state.shape[-1]
+        return plan[..., :width], plan[:, 0, width:].clamp(-self.bound, self.bound)
+
+    def plan(self, state: Tensor, pin: Pin | None) -> Tensor:
+        """Plans [Q, H, S + A] in raw units for raw states [Q, S]."""
+        rows, width = state.shape
+        states = state.new_zeros(rows, self.horizon, width)
+        mask = torch.zeros(rows, self.horizon, 1, dtype=torch.bool, device=state.device)
+        states[:, 0], mask[:, 0] = state, True
+        if pin is not None:
+            states, mask = pin.write(states, mask)
+        copies = self.candidates
+        states, mask = states.repeat_interleave(copies, 0), mask.repeat_interleave(copies, 0)
+        free = states.new_zeros(*states.shape[:2], self.action_dim)
+        of_actions = torch.zeros_like(free, dtype=torch.bool)
+        known = torch.cat([self.normalizer(states), free], -1)
+        generator = self._generator(state.device)
+        (network,) = self._step_networks(state.device)
+        with torch.autocast(state.device.type, enabled=False):
+            given = network.prepare(mask)
+            sample = sample_plan(
+                self.process,
+                lambda x, step: network(x, given, step, slice(None)),
+                self._noise(rows, copies, self.horizon, generator, known),
+                known,
+                torch.cat([mask.expand_as(states), of_actions], -1),
+                self.steps,
+                guidance=self._guidance(mask),
+                fresh=lambda: self._draw(rows, copies, self.horizon, generator, known),
+            )
+            # exact in raw units: what is known is not sent through the normaliser and back
+            planned = torch.where(mask, states, self.normalizer.inverse(sample[..., :width]))
+            plans = torch.cat([planned, sample[..., width:]], -1)
+            if copies == 1:
+                return plans
+            assert self.return_model is not None
+            returns = self.return_model(plans, mask)
+        return best_plans(plans.unflatten(0, (rows, copies)), returns.view(rows, copies))
+
+    def _guidance(self, mask: Tensor) -> Guidance | None:
+        """Gradients of the return model, which are scaled by the posterior variance."""
+        model = self.return_model
+        if model is None or self.guide_scale == 0 or self.guide_steps == 0:
+            return None
+        assert isinstance(self.process, Diffusion)
+        variance, grid = self.process.variance, self.process.grid(self.steps)
+        guided = self.steps - self.guide_stop
+        scales = [
+            self.guide_scale * variance(time, following) if step < guided else 0.0
+            for step, (time, following) in enumerate(pairwise(grid))
+        ]
+
+        def gradient(sample: Tensor, step: int) -> Tensor:
+            time = torch.full((1,), grid[step], device=sample.device)
+            with torch.inference_mode(False), torch.enable_grad():
+                x = sample.clone().requires_grad_()
+                value = model.standardised(x, mask.clone(), time.clone()).sum()
+                return torch.autograd.grad(value, x)[0]
+
+        return Guidance(gradient, scales, self.guide_steps)
