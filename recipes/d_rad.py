@@ -13,7 +13,7 @@ from typing import Any
 import hydra
 from omegaconf import DictConfig, OmegaConf
 
-from torchrl_rad import NoisyReturnLoss, Objective, TrajectoryLoss
+from torchrl_rad import Objective, SequenceDenoisingLoss, SequenceGuidanceLoss
 from torchrl_rad.experiment import BACKBONE, PolicyParts, run_recipe, step_objective
 from torchrl_rad.precision import uses_bf16
 
@@ -24,11 +24,12 @@ def make_objectives(
     """L_d, L_e and L_g; L_d again for the backbone."""
     planner, backbone = (policies[name].policy[-1] for name in (trained, BACKBONE))
     optim, loss, steps = cfg["optim"], cfg["loss"], cfg["optim"]["gradient_steps"]
-    shared = {"no_target": loss["no_target"]}
+    shared = {name: loss[name] for name in ("no_target", "pseudo_step")}
 
     def denoising(planner) -> Objective:
-        options = {"pseudo_step": loss["pseudo_step"], "action_weight": loss["next_weight"]}
-        module = TrajectoryLoss(planner, delay=True, **shared, **options)
+        module = SequenceDenoisingLoss(
+            planner, action_weight=loss["next_weight"], delay=True, **shared
+        )
         rates = {name: optim[name] for name in ("lr", "warmup", "weight_decay", "ema")}
         bf16 = uses_bf16(optim["precision"], cfg["device"])
         return Objective(module, lambda windows: windows, steps=steps, bf16=bf16, **rates)
@@ -39,7 +40,7 @@ def make_objectives(
         "estimator": step_objective(cfg, policies[trained].policy[1]),
     }
     if planner.return_model is not None:
-        module = NoisyReturnLoss(planner, gamma=loss["gamma"], **shared)
+        module = SequenceGuidanceLoss(planner, gamma=loss["gamma"], **shared)
         if loss["value"] == "iql":
             module.set_keys(value="value")
         options = {"lr": optim["lr"], "warmup": optim["warmup"]}

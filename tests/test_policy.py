@@ -18,6 +18,7 @@ from torchrl.data import LazyTensorStorage
 
 from torchrl_rad import (
     DiffuserLitePlanner,
+    DiffuserPlanner,
     ExpertDatabase,
     GoalReward,
     RetrievalSampler,
@@ -49,6 +50,18 @@ ABOUT = {
     "maze": "umaze",
     "target": {"rule": "followed", "ahead": 4},
     "estimator": {"width": 16, "estimate": "mode"},
+}
+DIFFUSER = {
+    **ABOUT,
+    "planner": {
+        "kind": "diffuser",
+        "horizon": 8,
+        "width": 8,
+        "multiples": [1, 2],
+        "steps": 3,
+        "candidates": 2,
+        "return_model": {"width": 8, "multiples": [1, 2]},
+    },
 }
 
 
@@ -129,6 +142,41 @@ def test_parts(database):
     assert planner.candidates == 2 and planner.return_model.tokens == 3
     assert "target_offset" in select.out_keys
     assert estimator.normalizer is planner.normalizer
+
+
+def test_parts_of_a_diffuser(database):
+    before = copy.deepcopy(DIFFUSER)
+    policy = make_policy(DIFFUSER, database)
+    select, estimator, planner = policy
+    assert isinstance(planner, DiffuserPlanner) and DIFFUSER == before
+    assert select.horizon == estimator.horizon == planner.horizon == 8
+    assert planner.candidates == 2 and planner.return_model.horizon == 8
+    assert estimator.normalizer is planner.normalizer is planner.return_model.normalizer
+    now, returns = recorded()["observation"], recorded()["return_to_go"]
+    torch.testing.assert_close(planner.normalizer.mean, now.mean(0))
+    assert planner.return_model.mean.item() == pytest.approx(returns.mean().item())
+    out = act(policy)
+    assert out["plan"].shape == (7, 8, 4) and out["action"].shape == (7, 2)
+    assert torch.equal(out["plan"][:, 0], out["observation"])
+    for row in range(7):
+        reached = torch.equal(out["plan"][row, out["target_step"][row, 0]], out["target"][row])
+        assert reached or not out["found"][row]
+
+
+def test_diffuser_without_a_return_model(tmp_path):
+    planner = {**DIFFUSER["planner"], "candidates": 1, "return_model": None, "sampler": "ddim"}
+    about = {**BACKBONE, "planner": planner}
+    policy = make_policy(about)
+    assert policy[0].return_model is None and not policy[0].targets
+    save_policy(tmp_path, policy, about)
+    assert torch.equal(act(policy)["action"], act(load_policy(tmp_path))["action"])
+
+
+def test_unknown_kind_of_planner():
+    with pytest.raises(
+        ValueError, match=r"is 'dit'; expected one of \['diffuser', 'diffuser_lite'"
+    ):
+        build_policy({**BACKBONE, "planner": {"kind": "dit"}})
 
 
 @pytest.mark.parametrize("target", [{}, {"target": None}])
@@ -234,6 +282,15 @@ def test_round_trip(saved):
     assert loaded[0].database is not policy[0].database
 
 
+def test_diffuser_round_trip(tmp_path, database):
+    policy = make_policy(DIFFUSER, database)
+    save_policy(tmp_path / "policy", policy, DIFFUSER, database)
+    loaded = load_policy(tmp_path / "policy")
+    assert_same(policy, loaded)
+    assert_same(policy, copy.deepcopy(policy))
+    assert_same(policy, pickle.loads(pickle.dumps(policy)))
+
+
 def test_backbone_round_trip(tmp_path):
     policy = make_policy(BACKBONE)
     save_policy(tmp_path / "deep" / "backbone", policy, BACKBONE)
@@ -267,6 +324,16 @@ def test_with_goals_nothing_is_trained(database):
     # the policy that it was made of is as it was
     assert policy[-1].database is database and policy[-1].candidates == 2
     assert act(policy)["found"].any()
+
+
+def test_a_diffuser_with_goals_is_not_guided(database):
+    policy = make_policy(DIFFUSER, database)
+    able = with_goals(policy, make_database(seed=3), goal_reward=GoalReward(0.3))
+    state, goal = recorded(3)["observation"][:2], recorded(3)["next", "observation"][5:7, :2]
+    out = able(TensorDict({"observation": state, "goal": goal}, [2]))
+    assert out["found"].all() and out["action"].isfinite().all()
+    assert able[-1].guide_scale == 0.0 and able[-1].candidates == 1
+    assert policy[-1].guide_scale == 1.0 and policy[-1].candidates == 2
 
 
 def test_goals_need_targets():

@@ -37,8 +37,11 @@ from torchrl_rad.retrieval.goals import GoalReward
 __all__ = ["build_policy", "fit_scales", "load_policy", "save_policy", "with_goals"]
 
 FORMAT = 1
-LITE = "diffuser_lite"
-HORIZONS = {LITE: 129, "diffuser": 32}
+# settings that must be known before a planner is built, by its kind
+PLANNERS: dict[str, dict[str, Any]] = {
+    "diffuser": {"horizon": 32, "candidates": 64, "return_model": {}},
+    "diffuser_lite": {"horizon": 129, "jumps": (32, 8, 1), "candidates": 1},
+}
 
 
 def build_policy(
@@ -49,7 +52,8 @@ def build_policy(
     Args:
         description (dict): ``state_dim``, ``action_dim`` and ``action_bound`` (1.0 if left out);
             ``planner``, ``estimator`` and ``target``: arguments of :class:`DiffuserLitePlanner` (of
-            :class:`DiffuserPlanner` if its ``kind`` is ``"diffuser"``, with ``guide_width``),
+            :class:`DiffuserPlanner` if its ``kind`` is ``"diffuser"``, whose ``return_model`` holds
+            arguments of :class:`NoisyReturnModel`, or None),
             :class:`StepEstimator` and :class:`RetrievalTargetModule`, a ``goal_reward`` as those of
             :class:`GoalReward`; the rules ``"random"``, ``"nearest"`` and ``"none"`` are those of
             :class:`PlainTargetModule`. The horizon of ``"target"`` holds for the estimator too; it
@@ -57,8 +61,8 @@ def build_policy(
         database (ExpertDatabase, optional): the demonstrations, needed with a target.
 
     Raises:
-        ValueError: a target is described and there is no database, or its horizon is larger than
-            the planner's or not the estimator's.
+        ValueError: the planner's kind is none of these; a target is described and there is no
+            database, or its horizon is larger than the planner's or not the estimator's.
 
     Examples:
         >>> policy = build_policy({
@@ -66,9 +70,13 @@ def build_policy(
         >>> policy.in_keys, policy.out_keys
         (['observation'], ['plan', 'action'])
     """
-    width, target = description["state_dim"], description.get("target")
-    planner_options = dict(description["planner"])
-    horizon = planner_options.get("horizon", HORIZONS[planner_options.get("kind", LITE)])
+    target = description.get("target")
+    kind = description["planner"].get("kind", "diffuser_lite")
+    if kind not in PLANNERS:
+        raise ValueError(f"kind of planner is {kind!r}; expected one of {sorted(PLANNERS)}.")
+    options = {**PLANNERS[kind], **description["planner"], "targets": target is not None}
+    options.pop("kind", None)
+    horizon = options["horizon"]
     estimator_options = dict(description.get("estimator") or {})
     reach = (target or {}).get("horizon", horizon)
     if reach > horizon:
@@ -82,9 +90,12 @@ def build_policy(
             f"the horizon of 'estimator' is {other}, but that of 'target' is {reach}; "
             "leave it out, so that the target's holds."
         )
-    states = Normalizer.identity(width)
-    make = _lite_planner if planner_options.pop("kind", LITE) == LITE else _diffuser
-    planner = make(description, states, horizon, planner_options, database)
+    states, action_dim = Normalizer.identity(description["state_dim"]), description["action_dim"]
+    bound = description.get("action_bound", 1.0)
+    if kind == "diffuser":
+        planner: Planner = _diffuser(states, action_dim, bound, options)
+    else:
+        planner = _diffuser_lite(states, action_dim, bound, options, database)
     if target is None:
         return TensorDictSequential(planner)
     if database is None:
@@ -94,28 +105,28 @@ def build_policy(
     return TensorDictSequential(select, estimator, planner)
 
 
-def _lite_planner(description, states, horizon, options, database) -> Planner:
-    difference, bound = Normalizer.identity(len(states.mean)), description.get("action_bound", 1.0)
-    inverse = InverseDynamics(states, difference, description["action_dim"], bound=bound)
-    if options.get("candidates", 1) > 1:
-        jump = options.get("jumps", (32,))[0]
-        options["return_model"] = ReturnModel(states, (horizon - 1) // jump + 1)
-    targets = description.get("target") is not None
-    return DiffuserLitePlanner(states, inverse, targets=targets, database=database, **options)
+def _diffuser_lite(
+    states: Normalizer,
+    action_dim: int,
+    bound: float,
+    options: dict[str, Any],
+    database: ExpertDatabase | None,
+) -> DiffuserLitePlanner:
+    difference = Normalizer.identity(len(states.mean))
+    inverse = InverseDynamics(states, difference, action_dim, bound=bound)
+    if options["candidates"] > 1:
+        tokens = (options["horizon"] - 1) // options["jumps"][0] + 1
+        options["return_model"] = ReturnModel(states, tokens)
+    return DiffuserLitePlanner(states, inverse, database=database, **options)
 
 
-def _diffuser(description, states, horizon, options, database) -> Planner:
-    guide = options.pop("guide_width", 16)
-    if options.get("candidates", 1) > 1:
-        sizes = (description["action_dim"], horizon, guide, options.get("multiples", (1, 2, 4, 8)))
-        options["return_model"] = NoisyReturnModel(states, *sizes)
-    return DiffuserPlanner(
-        states,
-        description["action_dim"],
-        targets=description.get("target") is not None,
-        bound=description.get("action_bound", 1.0),
-        **options,
-    )
+def _diffuser(
+    states: Normalizer, action_dim: int, bound: float, options: dict[str, Any]
+) -> DiffuserPlanner:
+    model = options.pop("return_model")
+    if model is not None:
+        model = NoisyReturnModel(states, action_dim, options["horizon"], **model)
+    return DiffuserPlanner(states, action_dim, return_model=model, bound=bound, **options)
 
 
 def _select(database: ExpertDatabase, options: dict[str, Any]) -> TensorDictModuleBase:
@@ -136,7 +147,7 @@ def with_goals(
     """The same planner on the way to a goal that each row brings along: nothing is trained.
 
     What the planner and the step estimator learned holds for any goal; the return model belongs to
-    the one it was trained for, so that plans are not ranked by it.
+    the one it was trained for, so that plans are neither ranked nor guided by it.
 
     Args:
         policy (TensorDictSequential): of :func:`build_policy`, with targets; its weights are
@@ -162,9 +173,11 @@ def with_goals(
         out_keys=select.named_out,
     )
     planner = copy.copy(planner)
-    planner.__dict__["database"], planner.candidates = database, 1
+    planner.candidates = 1
     if isinstance(planner, DiffuserPlanner):
         planner.guide_scale = 0.0
+    else:
+        planner.__dict__["database"] = database
     return TensorDictSequential(select, estimator, planner)
 
 

@@ -30,9 +30,9 @@ PAPER = {  # RAD's appendix: horizon, jumps, expert rule, similarity
 }
 
 
-def config(task):
+def config(task, recipe="dl_rad"):
     with initialize_config_dir(str(CONFIG.absolute()), version_base="1.3"):
-        cfg = compose("dl_rad", overrides=[f"task={task}"])
+        cfg = compose(recipe, overrides=[f"task={task}"])
     return OmegaConf.to_container(cfg, resolve=True)
 
 
@@ -83,6 +83,26 @@ def test_the_paper_s_settings(name):
     sampler = paper["sampler"]
     assert (sampler["metric"], sampler["threshold"], sampler["k"]) == (metric, threshold, 500)
     assert sampler["dims"] == (None if metric == "cosine" else [0, 1])
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_d_rad_s_settings(name):
+    cfg = config(name, "d_rad")
+    diffuser = cfg["diffuser"]
+    horizons = {  # RAD's appendix, whose 265 must be 256: a U-Net halves it
+        "antmaze": 64, "ogbench": 64, "pointmaze-umaze": 128, "pointmaze-medium": 256,
+        "pointmaze-large": 384,
+    }  # fmt: skip
+    expected = horizons.get(name, horizons.get(name.split("-")[0], 32))
+    assert diffuser["horizon"] == expected
+    assert cfg["retrieval"]["paper"]["sampler"]["k"] == 6
+    reach = diffuser.pop("step_horizon")
+    diffuser.pop("step_width")
+    for options in cfg["retrieval"].values():
+        target = {"horizon": reach, **options["target"]}
+        small = {**diffuser, "width": 8, "return_model": {"width": 8}}
+        about = {"state_dim": 4, "action_dim": 2, "planner": small}
+        build_policy({**about, "target": target}, ExpertDatabase())
 
 
 def test_data_sets_that_are_here_come_first(tmp_path, monkeypatch):

@@ -21,7 +21,7 @@ from torchrl_rad.policy import build_policy, fit_scales, save_policy
 
 RECIPE = Path(__file__).parents[2] / "recipes" / "evaluate.py"
 ABOUT = {
-    "maze": "umaze",
+    "env": {"name": "pointmaze-umaze", "family": "pointmaze", "maze": "umaze"},
     "state_dim": 4,
     "action_dim": 2,
     "planner": {

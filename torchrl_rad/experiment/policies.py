@@ -11,7 +11,7 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictSequential
 from torchrl.data import LazyTensorStorage
 
-from torchrl_rad.checkpoint import read_json
+from torchrl_rad.checkpoint import CheckpointError, read_json
 from torchrl_rad.data.database import ExpertDatabase
 from torchrl_rad.data.experts import expert_from_config
 from torchrl_rad.envs.maze import MazeTask
@@ -124,16 +124,19 @@ def saved_task(folder: str | Path) -> Task:
     """The task of a saved policy.
 
     Raises:
-        FileNotFoundError: the folder holds no policy.
+        CheckpointError: the folder holds no policy, or one that does not say of which task.
     """
-    return make_task(read_json(Path(folder) / "policy.json")["env"])
+    about = read_json(Path(folder) / "policy.json")
+    if "env" not in about:
+        raise CheckpointError(f"the policy in {folder} does not say of which task it is ('env').")
+    return make_task(about["env"])
 
 
 def saved_maze(folder: str | Path) -> MazeTask:
     """The task of a saved policy, which must be a PointMaze.
 
     Raises:
-        FileNotFoundError: the folder holds no policy.
+        CheckpointError: the folder holds no policy, or one that does not say of which task.
         ValueError: it is of another task.
     """
     task = saved_task(folder)

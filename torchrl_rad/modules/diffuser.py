@@ -89,6 +89,7 @@ class DiffuserPlanner(Planner):
     """
 
     plan_times: Tensor
+    process: Diffusion
     return_model: NoisyReturnModel | None
 
     def __init__(
@@ -142,8 +143,8 @@ class DiffuserPlanner(Planner):
                 f"the return model sees {seen[0]} steps of {seen[1]} entries; these plans have "
                 f"{horizon} of {state_dim + action_dim}."
             )
-        self.action_dim, self.bound = action_dim, bound
         self.horizon, self.levels = horizon, [Level(1, horizon)]
+        self.action_dim, self.bound = action_dim, bound
         self.guide_scale, self.guide_steps, self.guide_stop = guide_scale, guide_steps, guide_stop
         self.placement = TargetPlacement("shifted")  # on this grid all placements are alike
         self.networks = PlanNetworks([TemporalUNet(state_dim + action_dim, width, multiples)])
@@ -198,11 +199,10 @@ class DiffuserPlanner(Planner):
         model = self.return_model
         if model is None or self.guide_scale == 0 or self.guide_steps == 0:
             return None
-        assert isinstance(self.process, Diffusion)
-        variance, grid = self.process.variance, self.process.grid(self.steps)
+        grid = self.process.grid(self.steps)
         guided = self.steps - self.guide_stop
         scales = [
-            self.guide_scale * variance(time, following) if step < guided else 0.0
+            self.guide_scale * self.process.variance(time, following) if step < guided else 0.0
             for step, (time, following) in enumerate(pairwise(grid))
         ]
 

@@ -245,7 +245,7 @@ class FrozenCache:
     """Keeps what was made from a module's weights for as long as these stay the same.
 
     Not every write on a parameter raises its version (fused optimisers and writes through ``.data``
-    do not), so the weights' vectors and the first row of each matrix are compared too. What no
+    do not), so the weights' vectors and the first row of each other are compared too. What no
     comparison of these shows is a write through ``.data`` that leaves them all as they are.
 
     Examples:
@@ -274,7 +274,7 @@ class FrozenCache:
         same = state == self.state
         if not same:
             self.state = state
-            self.samples = [(p if p.ndim < 2 else p[0]).detach().flatten() for p in parameters]
+            self.samples = [p.detach()[(0,) * (p.ndim - 1)].view(-1) for p in parameters]
         sample = torch.cat(self.samples) if self.samples else torch.empty(0)
         if not same or not torch.equal(sample, self.before):
             self.before, self.made = sample, {}

@@ -43,14 +43,12 @@ class TimeCode(nn.Module):
 
     def __init__(self, width: int):
         super().__init__()
-        self.width = width
-        self.net = nn.Sequential(
-            nn.Linear(width, 4 * width), nn.Mish(), nn.Linear(4 * width, width), nn.Mish()
-        )
+        self.width, self.first = width, nn.Linear(width, 4 * width)
+        self.rest = nn.Sequential(nn.Mish(), nn.Linear(4 * width, width), nn.Mish())
 
     def forward(self, time: Tensor) -> Tensor:
-        dtype = next(self.net.parameters()).dtype
-        return self.net(sinusoids(1000.0 * time, self.width).to(dtype))
+        codes = sinusoids(1000.0 * time, self.width).to(self.first.weight.dtype)
+        return self.rest(self.first(codes))
 
 
 class Encoder(nn.Module):

@@ -2,16 +2,16 @@
 
 from torchrl_rad.objectives.denoising import DenoisingLoss
 from torchrl_rad.objectives.guidance import ReturnGuidanceLoss, plan_return
+from torchrl_rad.objectives.sequence import SequenceDenoisingLoss, SequenceGuidanceLoss
 from torchrl_rad.objectives.step import StepEstimationLoss, draw_step_pairs
-from torchrl_rad.objectives.trajectory import NoisyReturnLoss, TrajectoryLoss
 from torchrl_rad.objectives.value import make_value_loss, state_values
 
 __all__ = [
     "DenoisingLoss",
-    "NoisyReturnLoss",
     "ReturnGuidanceLoss",
+    "SequenceDenoisingLoss",
+    "SequenceGuidanceLoss",
     "StepEstimationLoss",
-    "TrajectoryLoss",
     "draw_step_pairs",
     "make_value_loss",
     "plan_return",

@@ -11,7 +11,9 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.objectives.common import LossModule
 
-__all__ = ["KeyedLoss", "window_masks"]
+from torchrl_rad.modules.normalizer import Normalizer
+
+__all__ = ["KeyedLoss", "check_share", "check_step", "read_windows", "window_masks"]
 
 
 class KeyedLoss(LossModule):
@@ -66,3 +68,33 @@ def window_masks(
             found[key] = mask.reshape(*shape, -1).all(-1)
     together = torch.stack(list(found.values())).all(0) if found else None
     return TensorDict(found, shape), together
+
+
+def read_windows(
+    normalizer: Normalizer, tensordict: TensorDictBase, key: NestedKey, horizon: int
+) -> Tensor:
+    """Windows of states [*B, H, S] in raw units.
+
+    Raises:
+        KeyError: there is no such entry.
+        ValueError: the windows have another length or width.
+    """
+    windows = normalizer.read(tensordict, key)
+    if windows.ndim < 2 or windows.shape[-2] != horizon:
+        raise ValueError(
+            f"{key!r} is {tuple(windows.shape)}; expected windows [*B, {horizon}, S], the horizon "
+            "that the planner was built for."
+        )
+    return windows
+
+
+def check_share(no_target: float) -> None:
+    """Raises ValueError for a share outside [0, 1]."""
+    if not 0.0 <= no_target <= 1.0:
+        raise ValueError(f"no_target is {no_target}; expected a share in [0, 1].")
+
+
+def check_step(pseudo_step: int | None, horizon: int) -> None:
+    """Raises ValueError for a step outside a plan."""
+    if pseudo_step is not None and not 1 <= pseudo_step < horizon:
+        raise ValueError(f"pseudo_step is {pseudo_step}; expected 1 to {horizon - 1}, or None.")

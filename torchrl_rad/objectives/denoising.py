@@ -11,8 +11,15 @@ from tensordict.nn import dispatch
 from tensordict.utils import NestedKey
 from torch import Tensor
 
-from torchrl_rad.modules.planner import Planner, PlanNetworks
-from torchrl_rad.objectives.common import KeyedLoss, window_masks
+from torchrl_rad.modules.diffuser_lite import DiffuserLitePlanner
+from torchrl_rad.modules.planner import PlanNetworks
+from torchrl_rad.objectives.common import (
+    KeyedLoss,
+    check_share,
+    check_step,
+    read_windows,
+    window_masks,
+)
 
 __all__ = ["DenoisingLoss"]
 
@@ -34,7 +41,7 @@ class DenoisingLoss(KeyedLoss):
     the weight of the state after the current one, which is what a plan is used for.
 
     Args:
-        planner (Planner): whose networks are trained.
+        planner (DiffuserLitePlanner): whose networks are trained.
 
     Keyword Args:
         no_target (float, optional): share of pieces without a target; a planner with
@@ -53,7 +60,7 @@ class DenoisingLoss(KeyedLoss):
         "mask")``, ...) may be [*B] or [*B, H]: a window counts if all its steps do.
 
     Examples:
-        >>> from torchrl_rad import DiffuserLitePlanner, InverseDynamics, Normalizer
+        >>> from torchrl_rad import InverseDynamics, Normalizer
         >>> states = Normalizer.identity(2)
         >>> inverse = InverseDynamics(states, states, 1)
         >>> planner = DiffuserLitePlanner(states, inverse, horizon=9, jumps=(4, 1), width=32)
@@ -81,7 +88,7 @@ class DenoisingLoss(KeyedLoss):
 
     def __init__(
         self,
-        planner: Planner,
+        planner: DiffuserLitePlanner,
         *,
         no_target: float = 0.2,
         pseudo_step: int | None = None,
@@ -90,12 +97,8 @@ class DenoisingLoss(KeyedLoss):
         reduction: Literal["none", "mean", "sum"] | None = None,
     ):
         super().__init__()
-        if not 0.0 <= no_target <= 1.0:
-            raise ValueError(f"no_target is {no_target}; expected a share in [0, 1].")
-        if pseudo_step is not None and not 1 <= pseudo_step < planner.horizon:
-            raise ValueError(
-                f"pseudo_step is {pseudo_step}; expected 1 to {planner.horizon - 1}, or None."
-            )
+        check_share(no_target)
+        check_step(pseudo_step, planner.horizon)
         self.convert_to_functional(planner.networks, "network", create_target_params=delay)
         self.planner_normalizer = planner.normalizer
         self.levels, self.horizon = planner.levels, planner.horizon
@@ -116,7 +119,14 @@ class DenoisingLoss(KeyedLoss):
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Loss of a batch of windows, and the mean of each level."""
-        windows, masks, shape = self._read(tensordict)
+        windows = read_windows(
+            self.planner_normalizer, tensordict, self.tensor_keys.observation, self.horizon
+        )
+        shape = windows.shape[:-2]
+        masks, counted = window_masks(self._loss_mask_keys(), tensordict, shape)
+        if counted is not None:  # what is masked may be NaN, also in the backward pass
+            windows = torch.where(counted[..., None, None], windows, 0.0)
+        windows = self.planner_normalizer(windows.reshape(-1, *windows.shape[-2:]))
         with self.network_params.to_module(self.network):
             levels = range(len(self.levels))
             losses = [self._level(number, windows).reshape(shape) for number in levels]
@@ -126,21 +136,6 @@ class DenoisingLoss(KeyedLoss):
         out = TensorDict(out)
         self._clear_weakrefs(tensordict, out, "network_params", "target_network_params")
         return out
-
-    def _read(self, tensordict: TensorDictBase) -> tuple[Tensor, TensorDict, torch.Size]:
-        """Standardised windows [B, H, S], masks for the reduction, and the shape [*B]."""
-        windows = self.planner_normalizer.read(tensordict, self.tensor_keys.observation)
-        if windows.ndim < 2 or windows.shape[-2] != self.horizon:
-            raise ValueError(
-                f"{self.tensor_keys.observation!r} is {tuple(windows.shape)}; expected windows "
-                f"[*B, {self.horizon}, S], the horizon that the planner was built for."
-            )
-        shape = windows.shape[:-2]
-        masks, counted = window_masks(self._loss_mask_keys(), tensordict, shape)
-        if counted is not None:  # what is masked may be NaN, also in the backward pass
-            windows = torch.where(counted[..., None, None], windows, 0.0)
-        windows = self.planner_normalizer(windows.reshape(-1, *windows.shape[-2:]))
-        return windows, masks, shape
 
     def _level(self, number: int, windows: Tensor) -> Tensor:
         """Loss of each window [B] on one level."""
