@@ -100,7 +100,7 @@ def test_d_rad_s_settings(name):
     diffuser.pop("step_width")
     for options in cfg["retrieval"].values():
         target = {"horizon": reach, **options["target"]}
-        small = {**diffuser, "width": 8, "return_model": {"width": 8}}
+        small = {**diffuser, "width": 8, "return_model": {**diffuser["return_model"], "width": 8}}
         about = {"state_dim": 4, "action_dim": 2, "planner": small}
         build_policy({**about, "target": target}, ExpertDatabase())
 

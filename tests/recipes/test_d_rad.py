@@ -72,7 +72,7 @@ def test_saved_policies_act(run):
 def test_scored_again_as_it_was(run):
     run, _ = run
     policy = str(run.path / "policies" / "paper")
-    options = ("--episodes", "2", "--precision", "fp32", "--threads", "1", "--seed", "10000")
+    options = ("--episodes", "2", "--threads", "1", "--seed", "10000")
     code, text, err = call("evaluate.py", policy, *options)
     assert code == 0, err
     assert f"| {run.results()['rows']['paper']['return']:.1f} |" in text

@@ -72,6 +72,9 @@ class PlainNetwork:
         self, network: nn.Module, times: Sequence[float], dtype: torch.dtype | None = None
     ):
         self.network, self.times, self.dtype = network, times, dtype
+        on_cpu = all(parameter.device.type == "cpu" for parameter in network.parameters())
+        if dtype == torch.float16 and on_cpu:  # quick there with packed weights only
+            self.dtype = None
 
     def prepare(self, mask: Tensor) -> Tensor:
         return mask
