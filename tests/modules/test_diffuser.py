@@ -9,7 +9,9 @@ from tensordict.nn import TensorDictSequential
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from torchrl_rad.modules.diffuser import DiffuserPlanner
-from torchrl_rad.modules.noisy_return_model import NoisyReturnModel
+from torchrl_rad.modules.frozen import PlainNetwork
+from torchrl_rad.modules.frozen_unet import FrozenReturnModel, FrozenUNet
+from torchrl_rad.modules.noisy_return_model import NoisyReturnModel, PlainReturnModel
 from torchrl_rad.modules.normalizer import Normalizer
 
 DIM, ACTIONS, HORIZON = 3, 2, 8
@@ -203,22 +205,21 @@ class FirstAction(torch.nn.Module):
         self.calls.append((plans.detach().clone(), float(time)))
         return plans[:, 0, DIM]
 
-    def forward(self, plans, mask):
-        self.plans = plans
-        return plans[:, 0, DIM]
-
 
 @pytest.mark.parametrize("noise", ["sample", "seeded"])
 def test_the_best_candidate_is_kept(noise):
     model = FirstAction()
     planner = make(noise=noise, candidates=16, return_model=model, guide_scale=0.0, bound=100.0)
     out = planner(batch(6))
-    plans = model.plans.unflatten(0, (6, 16))
+    ((plans, time),) = model.calls
+    plans = plans.unflatten(0, (6, 16))
     best = plans[torch.arange(6), plans[:, :, 0, DIM].argmax(-1)]
-    assert torch.equal(out["plan"], best[..., :DIM])
+    assert time == 0.0  # finished plans are compared
+    torch.testing.assert_close(out["plan"], planner.normalizer.inverse(best[..., :DIM]))
     assert torch.equal(out["action"], best[:, 0, DIM:])
     assert (plans[:, :, 0, DIM].std(1) > 0).all()
-    assert torch.equal(plans[:, :, 0, :DIM], out["observation"][:, None].expand(6, 16, DIM))
+    start = planner.normalizer(out["observation"])[:, None].expand(6, 16, DIM)
+    assert torch.equal(plans[:, :, 0, :DIM], start)
 
 
 def test_guidance_by_hand():
@@ -270,6 +271,24 @@ def test_in_inference_mode():
     with torch.inference_mode():
         plan = planner(td.copy())["plan"].clone()
     torch.testing.assert_close(plan, planner(td)["plan"])
+
+
+@pytest.mark.parametrize("horizon", [8, 16])
+@pytest.mark.parametrize("dtype", [None, torch.float16])
+def test_frozen_networks_plan_as_the_networks_do(horizon, dtype):
+    options = {"guided": True, "candidates": 4, "noise": "seeded", "guide_scale": 5.0, "steps": 5}
+    planner, td = make(horizon=horizon, **options), batch(6, horizon=horizon)
+    with torch.autocast("cpu", dtype, enabled=dtype is not None):
+        frozen = planner(td.copy())
+    assert type(planner._step_networks(torch.device("cpu"))[0]) is FrozenUNet
+    assert type(planner._returns(torch.device("cpu"))) is FrozenReturnModel
+    for module in (planner.networks[0], planner.return_model):
+        module.register_forward_hook(lambda module, args, out: None)  # calls are watched
+    assert type(planner._step_networks(torch.device("cpu"))[0]) is PlainNetwork
+    assert type(planner._returns(torch.device("cpu"))) is PlainReturnModel
+    plain = planner(td)
+    torch.testing.assert_close(frozen["plan"], plain["plan"], atol=1e-3, rtol=1e-3)
+    torch.testing.assert_close(frozen["action"], plain["action"], atol=1e-3, rtol=1e-3)
 
 
 # keys

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import pairwise
-from typing import Literal
+from typing import Literal, cast
 
 import torch
 from tensordict.utils import NestedKey
-from torch import Tensor
+from torch import Tensor, nn
 
+from torchrl_rad.modules.frozen import FrozenCache, PlainNetwork, StepNetwork, is_hooked
+from torchrl_rad.modules.frozen_unet import FrozenReturnModel, FrozenUNet, can_tile
 from torchrl_rad.modules.levels import Level
-from torchrl_rad.modules.noisy_return_model import NoisyReturnModel
+from torchrl_rad.modules.noisy_return_model import NoisyReturnModel, PlainReturnModel, StepReturns
 from torchrl_rad.modules.normalizer import Normalizer
 from torchrl_rad.modules.placement import TargetPlacement
 from torchrl_rad.modules.planner import Noise, Pin, Planner, PlanNetworks, Told, best_plans
@@ -149,6 +151,7 @@ class DiffuserPlanner(Planner):
         self.placement = TargetPlacement("shifted")  # on this grid all placements are alike
         self.networks = PlanNetworks([TemporalUNet(state_dim + action_dim, width, multiples)])
         self.register_buffer("plan_times", torch.arange(horizon), persistent=False)
+        self._frozen_returns = FrozenCache()
 
     def decide(self, state: Tensor, told: Told | None) -> tuple[Tensor, Tensor]:
         pin = None
@@ -173,6 +176,7 @@ class DiffuserPlanner(Planner):
         known = torch.cat([self.normalizer(states), free], -1)
         generator = self._generator(state.device)
         (network,) = self._step_networks(state.device)
+        returns = self._returns(state.device)
         with torch.autocast(state.device.type, enabled=False):
             given = network.prepare(mask)
             sample = sample_plan(
@@ -182,7 +186,7 @@ class DiffuserPlanner(Planner):
                 known,
                 torch.cat([mask.expand_as(states), of_actions], -1),
                 self.steps,
-                guidance=self._guidance(mask),
+                guidance=self._guidance(returns, mask),
                 fresh=lambda: self._draw(rows, copies, self.horizon, generator, known),
             )
             # exact in raw units: what is known is not sent through the normaliser and back
@@ -190,27 +194,46 @@ class DiffuserPlanner(Planner):
             plans = torch.cat([planned, sample[..., width:]], -1)
             if copies == 1:
                 return plans
-            assert self.return_model is not None
-            returns = self.return_model(plans, mask)
-        return best_plans(plans.unflatten(0, (rows, copies)), returns.view(rows, copies))
+            assert returns is not None
+            worth = returns.value(sample, mask, self.steps)  # at the last time, without noise
+        return best_plans(plans.unflatten(0, (rows, copies)), worth.view(rows, copies))
 
-    def _guidance(self, mask: Tensor) -> Guidance | None:
+    def _guidance(self, returns: StepReturns | None, mask: Tensor) -> Guidance | None:
         """Gradients of the return model, which are scaled by the posterior variance."""
-        model = self.return_model
-        if model is None or self.guide_scale == 0 or self.guide_steps == 0:
+        if returns is None or self.guide_scale == 0 or self.guide_steps == 0:
             return None
-        grid = self.process.grid(self.steps)
         guided = self.steps - self.guide_stop
         scales = [
             self.guide_scale * self.process.variance(time, following) if step < guided else 0.0
-            for step, (time, following) in enumerate(pairwise(grid))
+            for step, (time, following) in enumerate(pairwise(self.process.grid(self.steps)))
         ]
+        return Guidance(
+            lambda sample, step: returns.gradient(sample, mask, step), scales, self.guide_steps
+        )
 
-        def gradient(sample: Tensor, step: int) -> Tensor:
-            time = torch.full((1,), grid[step], device=sample.device)
-            with torch.inference_mode(False), torch.enable_grad():
-                x = sample.clone().requires_grad_()
-                value = model.standardised(x, mask.clone(), time.clone()).sum()
-                return torch.autograd.grad(value, x)[0]
+    # networks at the times of the sampler
 
-        return Guidance(gradient, scales, self.guide_steps)
+    def _step_network(
+        self, network: nn.Module, times: Sequence[float], dtype: torch.dtype | None
+    ) -> StepNetwork:
+        if self._freezes(network, TemporalUNet) and dtype in (None, torch.float16):
+            return FrozenUNet(cast(TemporalUNet, network), times)  # a CPU convolves in float32
+        return PlainNetwork(network, times, dtype)
+
+    def _returns(self, device: torch.device) -> StepReturns | None:
+        model = self.return_model
+        if model is None:
+            return None
+        times = self.process.grid(self.steps)
+        if device.type != "cpu" or not self._freezes(model, NoisyReturnModel):
+            return PlainReturnModel(model, times)
+        return self._frozen_returns.get(
+            model, tuple(times), lambda: FrozenReturnModel(model, times)
+        )
+
+    def _freezes(self, network: nn.Module, kind: type) -> bool:
+        """Whether a network can be called in its frozen form, and nobody watches its calls."""
+        if type(network) is not kind or is_hooked(network):
+            return False
+        on_cpu = next(network.parameters()).is_cpu
+        return on_cpu and can_tile(self.horizon, len(cast(TemporalUNet, network).multiples))

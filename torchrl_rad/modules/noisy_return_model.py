@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Protocol
 
 import torch
 from torch import Tensor, nn
@@ -11,7 +12,7 @@ from torchrl_rad.modules.normalizer import Normalizer
 from torchrl_rad.modules.return_model import ReturnScale
 from torchrl_rad.modules.temporal_unet import Encoder, TimeCode, check_length, check_sequence
 
-__all__ = ["NoisyReturnModel"]
+__all__ = ["NoisyReturnModel", "PlainReturnModel", "StepReturns"]
 
 
 class NoisyReturnModel(ReturnScale):
@@ -47,7 +48,7 @@ class NoisyReturnModel(ReturnScale):
     ):
         check_length(horizon, len(multiples))
         super().__init__(normalizer)
-        self.action_dim, self.horizon = action_dim, horizon
+        self.action_dim, self.horizon, self.multiples = action_dim, horizon, tuple(multiples)
         self.entries = len(normalizer.mean) + action_dim
         self.time = TimeCode(width)
         self.encoder = Encoder(self.entries + 1, width, multiples)
@@ -84,3 +85,41 @@ class NoisyReturnModel(ReturnScale):
         time = torch.zeros(1, device=plans.device)
         predicted = self.standardised(self.normalised(plans), mask, time)
         return predicted * self.deviation + self.mean
+
+
+class StepReturns(Protocol):
+    """A noisy return model at the times of a sampler."""
+
+    def value(self, x: Tensor, mask: Tensor, step: int) -> Tensor:
+        """Predicted return [B] of normalised plans [B, H, D], in units of the deviation."""
+
+    def gradient(self, x: Tensor, mask: Tensor, step: int) -> Tensor:
+        """Of that return with respect to ``x``."""
+
+
+class PlainReturnModel:
+    """Calls a return model as it is, and autograd.
+
+    Args:
+        model (nn.Module): has ``standardised``, as :class:`NoisyReturnModel`.
+        times (sequence of float): of the process, one a step.
+
+    Examples:
+        >>> model = NoisyReturnModel(Normalizer.identity(2), 1, 8, width=8, multiples=(1, 2))
+        >>> plain, mask = PlainReturnModel(model, [1.0]), torch.zeros(3, 8, 1, dtype=torch.bool)
+        >>> plain.gradient(torch.randn(3, 8, 3), mask, 0).shape
+        torch.Size([3, 8, 3])
+    """
+
+    def __init__(self, model: nn.Module, times: Sequence[float]):
+        self.model, self.times = model, times
+
+    def value(self, x: Tensor, mask: Tensor, step: int) -> Tensor:
+        time = torch.full((1,), self.times[step], device=x.device)
+        return self.model.standardised(x, mask, time)  # type: ignore[operator]
+
+    def gradient(self, x: Tensor, mask: Tensor, step: int) -> Tensor:
+        # tensors of inference mode cannot be differentiated; copies made outside of it can
+        with torch.inference_mode(False), torch.enable_grad():
+            x = x.clone().requires_grad_()
+            return torch.autograd.grad(self.value(x, mask.clone(), step).sum(), x)[0]

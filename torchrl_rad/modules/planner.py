@@ -156,12 +156,17 @@ class Planner(TensorDictModuleBase):
         times = self.process.grid(self.steps)[:-1]
 
         def make() -> list[StepNetwork]:
-            return [step_network(network, times, dtype) for network in self.networks]
+            return [self._step_network(network, times, dtype) for network in self.networks]
 
         if device.type != "cpu":
             return make()  # nothing is packed there, and to compare weights would wait for it
         hooked = tuple(map(is_hooked, self.networks))
         return self._frozen.get(self.networks, (dtype, hooked, *times), make)
+
+    def _step_network(
+        self, network: nn.Module, times: Sequence[float], dtype: torch.dtype | None
+    ) -> StepNetwork:
+        return step_network(network, times, dtype)
 
     # noise and candidates
 
