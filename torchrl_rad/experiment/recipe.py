@@ -153,6 +153,9 @@ def _whole_run(
             total, kept = (len(t["episode"].unique()) for t in (data, parts.database[:]))
             share = f"{kept} of {total} episodes ({kept / total:.1%})"
             print(f"{name}: {share}, {len(parts.database)} rows", flush=True)
+            if kept == total and parts.database.expert is not None:
+                advice = f"retrieval.{name}.expert='{{rule: top_share_by_return, args: [0.1]}}'"
+                print(f"WARNING: {name}'s rule keeps every episode; choose by {advice}", flush=True)
     data = data.to(cfg["device"]) if cfg["device"] != "cpu" else data
     if cfg["loss"]["value"] == "iql":
         data["value"] = learn_value(run, cfg, data, task.over(data))
