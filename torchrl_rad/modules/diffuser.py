@@ -7,6 +7,7 @@ from itertools import pairwise
 from typing import Literal, cast
 
 import torch
+from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
 
@@ -16,7 +17,7 @@ from torchrl_rad.modules.levels import Level
 from torchrl_rad.modules.noisy_return_model import NoisyReturnModel, PlainReturnModel, StepReturns
 from torchrl_rad.modules.normalizer import Normalizer
 from torchrl_rad.modules.placement import TargetPlacement
-from torchrl_rad.modules.planner import Noise, Pin, Planner, PlanNetworks, Told, best_plans
+from torchrl_rad.modules.planner import Noise, Pin, Planner, PlanNetworks, best_plans
 from torchrl_rad.modules.process import Diffusion, make_process
 from torchrl_rad.modules.sampling import Guidance, sample_plan
 from torchrl_rad.modules.temporal_unet import TemporalUNet, check_length
@@ -153,9 +154,10 @@ class DiffuserPlanner(Planner):
         self.register_buffer("plan_times", torch.arange(horizon), persistent=False)
         self._frozen_returns = FrozenCache()
 
-    def decide(self, state: Tensor, told: Told | None) -> tuple[Tensor, Tensor]:
+    def decide(self, state: Tensor, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
         pin = None
-        if told is not None:
+        if self.targets:
+            told = self._told(tensordict, len(state))
             place = self.placement(told.step, 0, *self.levels[0])
             pin = Pin(place.token, told.target, told.found & place.active)
         plan, width = self.plan(state, pin), state.shape[-1]

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import Literal
 
 import torch
+from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
 
@@ -16,7 +17,7 @@ from torchrl_rad.modules.inverse import InverseDynamics
 from torchrl_rad.modules.levels import plan_levels, plan_times
 from torchrl_rad.modules.normalizer import Normalizer
 from torchrl_rad.modules.placement import TargetPlacement
-from torchrl_rad.modules.planner import Noise, Pin, Planner, PlanNetworks, Told, best_plans
+from torchrl_rad.modules.planner import Noise, Pin, Planner, PlanNetworks, best_plans
 from torchrl_rad.modules.process import make_process
 from torchrl_rad.modules.return_model import ReturnModel
 from torchrl_rad.modules.sampling import sample_plan
@@ -138,19 +139,18 @@ class DiffuserLitePlanner(Planner):
         )
         self.register_buffer("plan_times", plan_times(levels), persistent=False)
 
-    def decide(self, state: Tensor, told: Told | None) -> tuple[Tensor, Tensor]:
-        plan = self.plan(state, self._pins(told))
+    def decide(self, state: Tensor, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
+        pins = self._pins(tensordict, len(state)) if self.targets else [None] * len(self.levels)
+        plan = self.plan(state, pins)
         with torch.autocast(state.device.type, enabled=False):  # too small to be faster
             return plan, self.inverse_dynamics(state, plan[:, 1])
 
     # what is known
 
-    def _pins(self, told: Told | None) -> list[Pin | None]:
+    def _pins(self, tensordict: TensorDictBase, rows: int) -> list[Pin | None]:
+        told = self._told(tensordict, rows)
         pins: list[Pin | None] = []
         for number, level in enumerate(self.levels):
-            if told is None:
-                pins.append(None)
-                continue
             place = self.placement(told.step, number, *level)
             state = told.target
             if told.row is not None:

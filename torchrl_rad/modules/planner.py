@@ -119,8 +119,13 @@ class Planner(TensorDictModuleBase):
         self.normalizer, self.return_model = normalizer, return_model
         self._frozen = FrozenCache()
 
-    def decide(self, state: Tensor, told: Told | None) -> tuple[Tensor, Tensor]:
-        """Plans [Q, L, S] and actions [Q, A] for raw states [Q, S]."""
+    def decide(self, state: Tensor, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
+        """Plans [Q, L, S] and actions [Q, A] for raw states [Q, S]; targets are read from the rest.
+
+        Args:
+            state (Tensor): what ``tensordict`` holds, flat and finite.
+            tensordict (TensorDictBase): see :meth:`_told`.
+        """
         raise NotImplementedError
 
     @dispatch(auto_batch_size=False)
@@ -130,13 +135,13 @@ class Planner(TensorDictModuleBase):
         observation = self.normalizer.read(tensordict, self.in_keys[0])
         shape, width = observation.shape[:-1], observation.shape[-1]
         state = torch.nan_to_num(observation, nan=0.0, posinf=0.0, neginf=0.0).reshape(-1, width)
-        told = self._told(tensordict, len(state)) if self.targets else None
-        plan, action = self.decide(state, told)
+        plan, action = self.decide(state, tensordict)
         tensordict.set(self.out_keys[0], plan.reshape(*shape, *plan.shape[1:]))
         tensordict.set(self.out_keys[1], action.reshape(*shape, action.shape[-1]))
         return tensordict
 
     def _told(self, tensordict: TensorDictBase, rows: int) -> Told:
+        """The targets of all rows, flat; they must be there."""
         target = self.normalizer.read(tensordict, self.in_keys[1])
         target = target.reshape(rows, target.shape[-1])
         found, step = (tensordict.get(key, None) for key in self.in_keys[2:4])
