@@ -379,6 +379,13 @@ def linear_windows(count, generator):
     return TensorDict({**entries, "next": {"reward": torch.stack(rewards, 1)}}, [count])
 
 
+def inconsistency(planner, td):
+    """How far planned positions are from where the planned velocity leads, the targets included."""
+    plan = planner(td.copy())["plan"]
+    assert torch.equal(plan[:, 6], td["target"])
+    return (plan[:, :-1, 0] + plan[:, 1:, 1] - plan[:, 1:, 0]).square().mean().sqrt()
+
+
 def test_training_on_linear_dynamics():
     torch.manual_seed(0)
     generator = torch.Generator().manual_seed(0)
@@ -390,6 +397,11 @@ def test_training_on_linear_dynamics():
     planner = DiffuserPlanner(
         states, 1, HORIZON, 16, (1, 2), return_model=model, noise="seeded", guide_scale=0.0
     )
+    fresh = linear_windows(50, generator)
+    td = TensorDict({"observation": fresh["observation"][:, 0]}, [50])
+    td["target"], td["target_step"] = fresh["observation"][:, 6], torch.full((50, 1), 6)
+    td["found"] = torch.ones(50, 1, dtype=torch.bool)
+    untrained = inconsistency(planner, td)
     objectives = [
         Objective(SequenceDenoisingLoss(planner), lambda w: w, lr=3e-3, steps=250, warmup=10),
         Objective(SequenceGuidanceLoss(planner), lambda w: w, lr=3e-3, steps=250, warmup=10),
@@ -401,16 +413,8 @@ def test_training_on_linear_dynamics():
     for number, name in enumerate(("loss_denoising", "loss_guidance")):
         values = [float(out[number][name]) for out in losses]
         assert sum(values[-20:]) < 0.6 * sum(values[:20]), name
-    # plans pass through a target that can be reached, and move as the data do
-    fresh = linear_windows(50, generator)
-    td = TensorDict({"observation": fresh["observation"][:, 0]}, [50])
-    td["target"], td["target_step"] = fresh["observation"][:, 6], torch.full((50, 1), 6)
-    td["found"] = torch.ones(50, 1, dtype=torch.bool)
-    plan = planner(td)["plan"]
-    assert torch.equal(plan[:, 6], td["target"])
-    moved = plan[:, :-1, 0] + plan[:, 1:, 1]  # position and new velocity
-    error = (moved - plan[:, 1:, 0]).square().mean().sqrt()
-    assert float(error) < 0.3 * float(fresh["observation"][..., 0].std())
+    # plans pass through the target, and move there as the data do
+    assert inconsistency(planner, td) < 0.5 * untrained
     # guided plans accelerate more
     plain = planner.plan(td["observation"], None)[..., -1].mean()
     planner.guide_scale = 2.0
