@@ -252,6 +252,8 @@ def _draw_plans(axis: Any, policy: TensorDictSequential, steps: TensorDictBase) 
     states = steps["observation"][at].to(next(policy.parameters()).device)
     with torch.no_grad():
         plans = policy(TensorDict({"observation": states}, [len(states)]))["plan"]
-    near = policy[-1].plan_times <= policy[-1].levels[0].jump
+    planner = policy[-1]
+    refined = planner.levels[0].jump if len(planner.levels) > 1 else planner.horizon
+    near = planner.plan_times <= refined
     for plan in plans[:, near].cpu().numpy():
         axis.plot(*plan[:, :2].T, "-o", color=PLAN, lw=1.4, ms=2.5, label="plan")

@@ -177,7 +177,7 @@ def test_training_places_as_planning_does(name, horizon, jumps):
             },
             [rows],
         )
-        pin = planner._pins(planner._told(td, rows))[number]
+        pin = planner._pins(td, rows)[number]
         here = torch.arange(level.tokens) == pin.token[:, None]
         known = (here & pin.active[:, None]) | (torch.arange(level.tokens) == 0)
         if number > 0:
