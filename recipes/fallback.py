@@ -15,12 +15,10 @@ import numpy as np
 import torch
 from tensordict import TensorDictBase
 from torchrl._utils import logger as torchrl_logger
-from torchrl.data import LazyTensorStorage
 
 from torchrl_rad import (
     ExpertDatabase,
     RetrievalSampler,
-    make_maze_env,
     reaches_goal,
     similarity_threshold,
 )
@@ -31,7 +29,7 @@ from torchrl_rad.data.regions import enters_region
 from torchrl_rad.envs import FixedGoalMaze
 from torchrl_rad.envs.maze import maze_cell
 from torchrl_rad.evaluation import episode_results, interval
-from torchrl_rad.experiment import collect_episodes, make_data, saved_maze
+from torchrl_rad.experiment import collect_episodes, make_data, make_database, saved_maze
 from torchrl_rad.policy import load_policy
 from torchrl_rad.precision import planning_dtype
 from torchrl_rad.runs import RunFolder, environment_facts
@@ -57,30 +55,27 @@ def parse() -> argparse.Namespace:
     return parser.parse_args()
 
 
-def demonstrations(data: TensorDictBase, maze: Any, without: list[tuple[int, int]]):
+def demonstrations(data: TensorDictBase, centres: torch.Tensor, half_width: float):
     """Steps of the recorded episodes that reach the goal and do not enter some cells."""
-    centres = torch.tensor(np.stack([maze.cell_rowcol_to_xy(np.array(cell)) for cell in without]))
-    gone = enters_region(data, centres, 0.5)
+    gone = enters_region(data, centres, half_width)
     lengths = episode_lengths(data)
     reaches = select_episodes(reaches_goal(), data.split(lengths.tolist()))
     if not (reaches & ~gone).any():
         raise ValueError("no demonstration is left that enters none of these cells.")
-    return data[torch.repeat_interleave(reaches & ~gone, lengths)].exclude("return_to_go")
+    return data[torch.repeat_interleave(reaches & ~gone, lengths)]
 
 
 def database_of(steps: TensorDictBase, like: ExpertDatabase, threshold: float) -> ExpertDatabase:
-    """The demonstrations among recorded steps, with another threshold."""
-    sampler = RetrievalSampler(**{**like.sampler.config, "threshold": threshold})
-    database = ExpertDatabase(LazyTensorStorage(len(steps)), like.gamma, reaches_goal(), sampler)
-    database.extend(steps)
-    return database
+    """Demonstrations searched as another database is, with another threshold."""
+    sampler = {**like.sampler.config, "threshold": threshold}
+    return make_database(steps, {"gamma": like.gamma, "sampler": sampler})
 
 
 def drive(arguments, task, policy, cells: list[tuple[int, int]], seed: int, name: str):
     """An episode from each cell, so many times."""
     policy[-1].candidates = 1
     starts = [cell for cell in cells for _ in range(arguments.episodes)]
-    env = make_maze_env(task, len(starts), reset_cell=starts)
+    env = task.make_env(len(starts), starts=starts)
     torch.set_num_threads(arguments.threads)
     steps = collect_episodes(env, policy, task.max_steps, seed, name, planning_dtype())
     env.close()
@@ -129,18 +124,18 @@ def main() -> None:
         task = saved_maze(folder)
         _, data = make_data(RunFolder.open(folder.parents[1]).config())
         like = ExpertDatabase.loads(folder / "database", memmap=True)
-        maze = FixedGoalMaze(task)
-        for cell in arguments.without:
-            FixedGoalMaze(task, reset_cell=cell).close()  # refuses one that is none
+        region = task.cells(arguments.without)
         if not 0.0 < arguments.level < 1.0:
             raise ValueError(f"--level is {arguments.level}; expected a share between 0 and 1.")
         if arguments.episodes < 1:
             raise ValueError(f"--episodes is {arguments.episodes}; at least one is needed.")
-        data = demonstrations(data, maze.maze, arguments.without)
+        data = demonstrations(data, *region)
         always = database_of(data, like, 0.0)
     except (CheckpointError, OSError, KeyError, ValueError) as error:
         sys.exit(f"error: {error.args[0] if isinstance(error, KeyError) else error}")
+    maze = FixedGoalMaze(task)
     cells = [tuple(cell) for cell in maze.free_cells.tolist()]
+    maze.close()
     covered = [cell for cell in cells if cell not in arguments.without]
     threshold = calibrated(arguments, task, folder, always, covered)
     print(f"calibrated at level {arguments.level}: similarity {threshold:.3f}")

@@ -13,12 +13,11 @@ import numpy as np
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
-from torchrl.envs import DoubleToFloat, GymWrapper, SerialEnv, TransformedEnv
-from torchrl.envs.transforms import Compose, InitTracker
+from torchrl.envs import TransformedEnv
 
 from torchrl_rad.data.episodes import with_reward
 from torchrl_rad.envs.adapter import ObservationAdapter
-from torchrl_rad.envs.task import Task
+from torchrl_rad.envs.task import Task, batched
 from torchrl_rad.retrieval.goals import GoalReward
 
 __all__ = ["MAZES", "FixedGoalMaze", "MazeTask", "make_maze_env", "maze_task", "relabel_goal"]
@@ -59,7 +58,7 @@ class MazeTask(Task):
     def starts(self) -> Tensor:
         env = FixedGoalMaze(self)
         env.close()
-        return self.cells(env.reset_cells.tolist())[0]
+        return cell_centres(self.env_id, env.maze, env.reset_cells.tolist())[0]
 
     def cells(self, cells: Sequence[tuple[int, int]]) -> tuple[Tensor, float]:
         env = FixedGoalMaze(self)
@@ -279,15 +278,10 @@ def make_maze_env(
 
     goals, starts = _one_a_row("goal", goal_cell, rows), _one_a_row("start", reset_cell, rows)
 
-    def make_row(goal: Any, start: Any) -> TransformedEnv:
-        # the cast sits inside each row: outside a batched env it breaks partial steps
-        maze = FixedGoalMaze(task, goal, start, show_goal=show_goal)
-        return TransformedEnv(GymWrapper(maze), DoubleToFloat())
-
-    mazes = [partial(make_row, *cells) for cells in zip(goals, starts, strict=True)]
-    env = TransformedEnv(SerialEnv(rows, mazes), Compose(InitTracker()))
-    env.set_seed(seed)
-    return env
+    mazes = [
+        partial(FixedGoalMaze, task, *cells, show_goal) for cells in zip(goals, starts, strict=True)
+    ]
+    return batched(mazes, seed)
 
 
 def _one_a_row(name: str, cell: Any, rows: int) -> list[Any]:

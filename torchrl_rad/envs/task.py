@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
@@ -17,7 +17,7 @@ from torchrl.envs.transforms import Compose, InitTracker
 
 from torchrl_rad.envs.adapter import ObservationAdapter
 
-__all__ = ["StartStates", "Task"]
+__all__ = ["StartStates", "Task", "batched"]
 
 
 class Task(ABC):
@@ -93,14 +93,20 @@ class Task(ABC):
         """
         if rows < 1:
             raise ValueError(f"rows is {rows}; an environment has at least one row.")
-        makers = [partial(self._row, number, starts) for number in range(rows)]
-        env = TransformedEnv(SerialEnv(rows, makers), Compose(InitTracker()))
-        env.set_seed(seed)
-        return env
+        return batched([partial(self.make_row, number, starts) for number in range(rows)], seed)
 
-    def _row(self, number: int, starts: Any) -> TransformedEnv:
+
+def batched(makers: Sequence[Callable[[], gym.Env]], seed: int) -> TransformedEnv:
+    """A TorchRL environment of gymnasium's, one a row."""
+
+    def row(make: Callable[[], gym.Env]) -> TransformedEnv:
         # the cast sits inside each row: outside a batched env it breaks partial steps
-        return TransformedEnv(GymWrapper(self.make_row(number, starts)), DoubleToFloat())
+        return TransformedEnv(GymWrapper(make()), DoubleToFloat())
+
+    env = SerialEnv(len(makers), [partial(row, make) for make in makers])
+    env = TransformedEnv(env, Compose(InitTracker()))
+    env.set_seed(seed)
+    return env
 
 
 class StartStates(gym.Wrapper):

@@ -124,6 +124,8 @@ class RetrievalTargetModule(TensorDictModuleBase):
         ([2.0, 9.0], [True, False])
     """
 
+    rule: str
+
     def __init__(
         self,
         database: ExpertDatabase,
@@ -295,23 +297,28 @@ class RetrievalTargetModule(TensorDictModuleBase):
         version, columns = self.database.version, self._columns
         if columns is None or columns.source is not source or columns.version != version:
             rows = self.database[:]
-            values, remaining = rows["return_to_go"], rows["remaining"]
-            key, gamma = self.database.sampler.key, self.database.gamma
-            if self.goal_key is not None:
-                limits = (self._experts(), self.horizon)
-                table = GoalTable(rows, key, gamma, self.goal_reward, *limits)
-                ahead = self.ahead if self.rule == "followed" else None
-                rule: TargetRule = GoalRule(table, self.horizon, self.min_offset, ahead)
-            elif self.rule == "followed":
-                rule = followed_rule(values, remaining, self.ahead)
-            else:
-                settings = (self.horizon, self.min_offset, self.tolerance)
-                rule = highest_rule(values, remaining, *settings)
-            if self.among > 1:
-                assert isinstance(rule, RankedRule)
-                rule = NoisyRule(rule, self.among)
+            key, rule = self.database.sampler.key, self._make_rule(rows)
             self._columns = columns = _Columns(source, version, rows[key], rule)
         return columns
+
+    def _make_rule(self, rows: TensorDictBase) -> TargetRule:
+        """The rule on the content of the database, [N]."""
+        values, remaining = rows["return_to_go"], rows["remaining"]
+        if self.goal_key is not None:
+            limits = (self._experts(), self.horizon)
+            key, gamma = self.database.sampler.key, self.database.gamma
+            table = GoalTable(rows, key, gamma, self.goal_reward, *limits)
+            ahead = self.ahead if self.rule == "followed" else None
+            rule: TargetRule = GoalRule(table, self.horizon, self.min_offset, ahead)
+        elif self.rule == "followed":
+            rule = followed_rule(values, remaining, self.ahead)
+        else:
+            settings = (self.horizon, self.min_offset, self.tolerance)
+            rule = highest_rule(values, remaining, *settings)
+        if self.among > 1:
+            assert isinstance(rule, RankedRule)
+            rule = NoisyRule(rule, self.among)
+        return rule
 
     # keeping a target for several steps
 
