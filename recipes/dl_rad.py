@@ -34,12 +34,13 @@ def make_objectives(
     steps, head = optim["gradient_steps"], {"lr": optim["head_lr"], "warmup": optim["warmup"]}
     bf16 = uses_bf16(optim["precision"], cfg["device"])
 
-    def denoising(planner) -> Objective:
+    def denoising(planner, only=None) -> Objective:
         module = DenoisingLoss(
             planner,
             no_target=loss["no_target"],
             pseudo_step=loss["pseudo_step"],
             next_weight=loss["next_weight"],
+            only=only,
             delay=True,
         )
         names = ("lr", "warmup", "weight_decay", "ema")
@@ -48,7 +49,8 @@ def make_objectives(
 
     objectives = {
         "planner": denoising(planner),
-        BACKBONE: denoising(backbone),
+        # finer levels without targets are the same ones: trained once
+        BACKBONE: denoising(backbone, only=[0] if planner.placement.first_only else None),
         "estimator": step_objective(cfg, estimator),
         "inverse": Objective(
             BCLoss(inverse_dynamics_actor(planner.inverse_dynamics), loss_function="l2"),

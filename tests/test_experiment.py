@@ -246,6 +246,18 @@ def test_shared_weights(policies):
     assert all(torch.equal(value, kept[key]) for key, value in own.items())
 
 
+def test_finer_levels_without_targets_are_the_backbones(data):
+    torch.manual_seed(0)
+    policies = make_policies({**NETWORK, "placement": "shifted_first"}, RETRIEVAL, data)
+    own = copy.deepcopy(policies[BACKBONE].policy[-1].networks[0].state_dict())
+    share_weights(policies, "paper")
+    backbone, given = (policies[name].policy[-1].networks for name in (BACKBONE, "paper"))
+    assert all(
+        torch.equal(v, given[1].state_dict()[k]) for k, v in backbone[1].state_dict().items()
+    )
+    assert all(torch.equal(v, own[k]) for k, v in backbone[0].state_dict().items())
+
+
 def test_step_error_by_hand(policies, monkeypatch):
     policy = policies["paper"].policy
     pairs = {

@@ -26,6 +26,7 @@ from torchrl_rad import (
     StepEstimator,
 )
 from torchrl_rad.checkpoint import CheckpointError, verify_manifest, write_json, write_manifest
+from torchrl_rad.modules.levels import level_changes
 from torchrl_rad.policy import (
     FORMAT,
     build_policy,
@@ -256,6 +257,20 @@ def test_scales_by_hand(database):
     returns = data["return_to_go"]
     assert planner.return_model.mean.item() == pytest.approx(returns.mean().item())
     assert planner.return_model.deviation.item() == pytest.approx(returns.std(correction=0).item())
+
+
+def test_scales_of_changes(tmp_path):
+    about = {**BACKBONE, "planner": {**PLANNER, "relative": True}}
+    policy, data = build_policy(about), recorded()
+    fit_scales(policy, data)
+    planner = policy[-1]
+    for level, scale in zip(planner.levels, planner.changes, strict=True):
+        expected = level_changes(data["observation"], data["episode"], level)
+        assert torch.equal(scale.deviation, expected.deviation)
+    save_policy(tmp_path / "policy", policy, about)
+    loaded = load_policy(tmp_path / "policy")[-1].changes.state_dict()
+    found = planner.changes.state_dict()
+    assert all(torch.equal(value, loaded[key]) for key, value in found.items())
 
 
 def test_scales_of_other_width():

@@ -25,6 +25,7 @@ from torchrl_rad.data.database import ExpertDatabase
 from torchrl_rad.modules.diffuser import DiffuserPlanner
 from torchrl_rad.modules.diffuser_lite import DiffuserLitePlanner
 from torchrl_rad.modules.inverse import InverseDynamics
+from torchrl_rad.modules.levels import level_changes
 from torchrl_rad.modules.noisy_return_model import NoisyReturnModel
 from torchrl_rad.modules.normalizer import Normalizer
 from torchrl_rad.modules.planner import Planner
@@ -182,12 +183,12 @@ def with_goals(
 
 
 def fit_scales(policy: TensorDictSequential, data: TensorDictBase) -> None:
-    """Takes over the scales of recorded data: of states, their change in a step, and of returns.
+    """Takes over the scales of recorded data: of states, their changes, and of returns.
 
     Args:
         policy (TensorDictSequential): of :func:`build_policy`; changed in place.
-        data (TensorDictBase): flat steps [T] with ``observation``, ``("next", "observation")`` and
-            ``return_to_go`` [T].
+        data (TensorDictBase): flat steps [T] with ``observation``, ``("next", "observation")``,
+            ``episode`` and ``return_to_go`` [T].
 
     Raises:
         ValueError: the states hold NaN or Inf, or have another width.
@@ -198,6 +199,8 @@ def fit_scales(policy: TensorDictSequential, data: TensorDictBase) -> None:
     if isinstance(planner, DiffuserLitePlanner):
         change = planner.inverse_dynamics.difference
         change.load_state_dict(_scale(following - now, change))
+        for level, scale in zip(planner.levels, planner.changes or (), strict=False):
+            scale.load_state_dict(level_changes(now, data["episode"], level).state_dict())
     if planner.return_model is not None:
         planner.return_model.fit_scale(data["return_to_go"])
 

@@ -209,10 +209,78 @@ def test_temperature_scales_the_noise():
     zero = make(noise="zero")(td.copy())["plan"]
     assert torch.equal(make(noise="sample", temperature=0.0)(td.copy())["plan"], zero)
     assert torch.equal(make(noise="seeded", temperature=0.0)(td.copy())["plan"], zero)
-    planner = make(noise="seeded", temperature=2.0)
-    noise = planner._noise(4, 1, 5, torch.Generator().manual_seed(0), td["observation"])
-    unit = make(noise="seeded")._noise(4, 1, 5, torch.Generator().manual_seed(0), noise)
-    assert torch.equal(noise, 2.0 * unit) and torch.equal(noise[0], noise[3])
+    td["found"] = torch.zeros(4, 1, dtype=torch.bool)
+    plans = []
+    for temperature in (1.0, 2.0):  # untrained networks of a flow leave the noise as it is
+        planner = make(noise="seeded", temperature=temperature)
+        for network in planner.networks:
+            network.reset_parameters()
+        plans.append(planner.normalizer(at(planner, planner(td.copy()), 6)))
+    torch.testing.assert_close(plans[1], 2.0 * plans[0])
+    torch.testing.assert_close(plans[0][0], plans[0][3])
+
+
+def test_a_temperature_for_each_level():
+    planner = make(temperature=[1.0, 0.0], noise="sample")
+    for network in planner.networks:
+        network.reset_parameters()
+    out = planner(batch(3, share=0.0))
+    mean = planner.normalizer.mean.expand(3, DIM)  # what zero noise is left as
+    torch.testing.assert_close(at(planner, out, 1), mean)
+    torch.testing.assert_close(at(planner, out, 2), mean)
+    assert ((at(planner, out, 6) - mean).abs() > 1e-3).all()
+    with pytest.raises(ValueError, match="one for each of the 2 levels"):
+        make(temperature=[1.0, 0.0, 0.0])
+
+
+# changes from the current state
+
+
+def make_relative(**kwargs):
+    planner = make(relative=True, **kwargs)
+    for number, scale in enumerate(planner.changes):
+        scale.deviation.copy_(torch.tensor([1.0, 2.0, 4.0]) * (number + 1))
+    return planner
+
+
+@pytest.mark.parametrize("noise", ["zero", "seeded"])
+def test_untrained_relative_planner_by_hand(noise):
+    planner = make_relative(noise=noise)
+    for network in planner.networks:
+        network.reset_parameters()
+    td = batch(4, share=0.0)
+    out = planner(td)
+    # the first level's noise, in units of its changes, around the current state
+    drawn = torch.randn(1, 5, DIM, generator=torch.Generator().manual_seed(0))[0, 2]
+    drawn = drawn if noise == "seeded" else torch.zeros(DIM)
+    expected = td["observation"] + drawn * torch.tensor([1.0, 2.0, 4.0])
+    torch.testing.assert_close(at(planner, out, 6), expected)
+
+
+@settings(max_examples=20, deadline=None)
+@given(seed=st.integers(0, 1000), placement=st.sampled_from(PLACEMENTS))
+def test_relative_plans_hold_what_is_known(seed, placement):
+    planner, td = make_relative(placement=placement), batch(5, seed=seed)
+    out = planner(td.copy())
+    assert torch.equal(out["plan"][:, 0], td["observation"])
+    place = planner.placement(td["target_step"].squeeze(-1), 0, *planner.levels[0])
+    for row in range(5):
+        if td["found"][row]:
+            time = int(place.token[row]) * planner.levels[0].jump
+            time = planner.plan_times.tolist().index(time)
+            assert torch.equal(out["plan"][row, time], td["target"][row])
+
+
+def test_relative_networks_see_changes():
+    planner, seen = make_relative(steps=1), []
+    planner.networks[0].register_forward_hook(lambda module, args, out: seen.append(args[0]))
+    td = batch(3, share=1.0)
+    td["target_step"] = torch.full((3, 1), 3)
+    planner(td)
+    now = planner.normalizer(td["observation"])
+    change = (td["target"] - td["observation"]) / torch.tensor([1.0, 2.0, 4.0])
+    torch.testing.assert_close(seen[0][:, 0], now)
+    torch.testing.assert_close(seen[0][:, 1], change)
 
 
 class LastState(torch.nn.Module):

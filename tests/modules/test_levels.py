@@ -1,6 +1,17 @@
 import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
 
-from torchrl_rad.modules.levels import plan_levels, plan_times
+from torchrl_rad.modules.levels import (
+    Level,
+    decode_states,
+    encode_states,
+    level_changes,
+    plan_levels,
+    plan_times,
+)
+from torchrl_rad.modules.normalizer import Normalizer
 
 
 def test_plan_levels_by_hand():
@@ -46,3 +57,43 @@ def test_horizon_too_short():
 )
 def test_plan_times_by_hand(horizon, jumps, expected):
     assert plan_times(plan_levels(horizon, jumps)).tolist() == expected
+
+
+# changes from the current state
+
+SCALE = Normalizer(torch.tensor([1.0, -2.0]), torch.tensor([2.0, 0.5]))
+CHANGE = Normalizer(torch.zeros(2), torch.tensor([0.5, 4.0]))
+
+
+def test_changes_in_units_by_hand():
+    plan = torch.tensor([[3.0, -2.0], [4.0, 2.0], [3.0, -4.0]])
+    expected = torch.tensor([[1.0, 0.0], [2.0, 1.0], [0.0, -0.5]])
+    assert torch.equal(encode_states(plan, SCALE, CHANGE), expected)
+    assert torch.equal(encode_states(plan, SCALE, None), SCALE(plan))
+
+
+@given(seed=st.integers(0, 1000), change=st.sampled_from([None, CHANGE]))
+def test_there_and_back(seed, change):
+    plans = torch.randn(3, 4, 5, 2, generator=torch.Generator().manual_seed(seed))
+    back = decode_states(encode_states(plans, SCALE, change), plans[..., :1, :], SCALE, change)
+    torch.testing.assert_close(back, plans)
+
+
+@given(
+    seed=st.integers(0, 1000),
+    lengths=st.lists(st.integers(1, 12), min_size=1, max_size=5),
+    level=st.sampled_from([Level(1, 5), Level(3, 3), Level(8, 2)]),
+)
+def test_scale_of_changes_by_brute_force(seed, lengths, level):
+    episode = torch.repeat_interleave(torch.arange(len(lengths)), torch.tensor(lengths))
+    states = torch.randn(len(episode), 2, generator=torch.Generator().manual_seed(seed))
+    changes = [
+        states[later] - states[row]
+        for row in range(len(states))
+        for later in range(row + level.jump, row + level.span + 1, level.jump)
+        if later < len(states) and episode[later] == episode[row]
+    ]
+    found = level_changes(states, episode, level)
+    expected = torch.stack(changes).square().mean(0).sqrt() if changes else torch.ones(2)
+    torch.testing.assert_close(found.deviation, expected)
+    assert torch.equal(found.mean, torch.zeros(2))

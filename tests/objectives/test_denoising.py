@@ -26,8 +26,9 @@ def make_planner(seed=0, **kwargs):
     return planner
 
 
-def make(seed=0, placement="shifted", process="flow", targets=True, **kwargs):
-    planner = make_planner(seed, placement=placement, process=process, targets=targets)
+def make(seed=0, placement="shifted", process="flow", targets=True, relative=False, **kwargs):
+    options = {"placement": placement, "process": process, "relative": relative}
+    planner = make_planner(seed, targets=targets, **options)
     return DenoisingLoss(planner, **kwargs)
 
 
@@ -123,6 +124,33 @@ def test_noisy_states_follow_the_process():
         assert time.shape == (2000,) and 0 <= time.min() < 0.01 and 0.99 < time.max() < 1
         noise = (sample / time[:, None, None])[~mask.expand_as(sample)]  # x = t * noise
         assert abs(float(noise.mean())) < 0.05 and abs(float(noise.std()) - 1) < 0.05
+
+
+def test_relative_networks_see_changes():
+    loss, seen = make(no_target=1.0, relative=True), []
+    for scale in loss.planner_changes:
+        scale.deviation.copy_(torch.tensor([0.5, 0.25]))
+    loss.network.register_forward_hook(lambda module, args, out: seen.append(args))
+    td = windows(500)
+    td["observation"] = torch.tensor([5.0, -3.5]).expand_as(td["observation"])  # stays
+    run(loss, td)
+    for _, sample, mask, time in seen:
+        torch.testing.assert_close(sample[:, 0], torch.tensor([2.0, -1.0]).expand(500, 2))
+        noise = (sample / time[:, None, None])[~mask.expand_as(sample)]  # of changes that are 0
+        assert abs(float(noise.mean())) < 0.1 and abs(float(noise.std()) - 1) < 0.1
+
+
+def test_some_levels_only():
+    loss, td = make(only=[1]), windows(6)
+    out = run(loss, td)
+    assert sorted(out.keys()) == ["level_1", "loss_denoising"] and "level_0" not in loss.out_keys
+    out["loss_denoising"].backward()
+    for number, trained in enumerate((False, True)):
+        for name, parameter in loss.network_params.named_parameters():
+            if name.startswith(str(number)):
+                assert (parameter.grad is not None) == trained
+    with pytest.raises(ValueError, match="only is \\[2\\]; these plans have levels 0 to 1"):
+        make(only=[2])
 
 
 @pytest.mark.parametrize("share", [0.0, 0.3, 1.0])

@@ -107,13 +107,15 @@ def make_policies(
 
 
 def share_weights(policies: Mapping[str, PolicyParts], trained: str) -> None:
-    """Gives the weights of one policy to all: all of them, or the backbone its heads alone."""
+    """Gives the weights of one policy to all: all of them, or the backbone what knows no target."""
     source = policies[trained].policy
     for name, parts in policies.items():
         if name == BACKBONE:
             own, given = parts.policy[-1], source[-1]
             if isinstance(own, DiffuserLitePlanner):
                 own.inverse_dynamics.load_state_dict(given.inverse_dynamics.state_dict())
+                if given.placement.first_only:
+                    own.networks[1:].load_state_dict(given.networks[1:].state_dict())
             if own.return_model is not None:
                 own.return_model.load_state_dict(given.return_model.state_dict())
         elif name != trained:

@@ -122,7 +122,7 @@ class DiffuserPlanner(Planner):
             normalizer,
             make_process(SAMPLERS[sampler]),
             steps,
-            temperature,
+            [temperature],
             candidates,
             return_model,
             noise,
@@ -184,7 +184,7 @@ class DiffuserPlanner(Planner):
             sample = sample_plan(
                 self.process,
                 lambda x, step: network(x, given, step, slice(None)),
-                self._noise(rows, copies, self.horizon, generator, known),
+                self.temperatures[0] * self._draw(rows, copies, self.horizon, generator, known),
                 known,
                 torch.cat([mask.expand_as(states), of_actions], -1),
                 self.steps,

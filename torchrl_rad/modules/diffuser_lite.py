@@ -8,13 +8,13 @@ from typing import Literal
 import torch
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
-from torch import Tensor
+from torch import Tensor, nn
 
 from torchrl_rad.data.database import ExpertDatabase
 from torchrl_rad.modules.dit import DiT
 from torchrl_rad.modules.frozen import StepNetwork
 from torchrl_rad.modules.inverse import InverseDynamics
-from torchrl_rad.modules.levels import plan_levels, plan_times
+from torchrl_rad.modules.levels import decode_states, encode_states, plan_levels, plan_times
 from torchrl_rad.modules.normalizer import Normalizer
 from torchrl_rad.modules.placement import TargetPlacement
 from torchrl_rad.modules.planner import Noise, Pin, Planner, PlanNetworks, best_plans
@@ -58,7 +58,8 @@ class DiffuserLitePlanner(Planner):
         process (str, optional): ``"flow"``, ``"diffusion"`` or ``"ancestral"``, see
             :func:`make_process`. Defaults to ``"flow"``.
         steps (int, optional): calls of the network a level. Defaults to ``3``.
-        temperature (float, optional): scale of the initial noise. Defaults to ``1.0``.
+        temperature (float or sequence of float, optional): scale of the initial noise, the same for
+            all levels or one for each. Defaults to ``1.0``.
         candidates (int, optional): first-level plans a row, of which the return model keeps the
             best. Defaults to ``1``.
         return_model (ReturnModel, optional): J; needed for more than one candidate.
@@ -70,6 +71,10 @@ class DiffuserLitePlanner(Planner):
         placement (str, optional): see :class:`TargetPlacement`. Defaults to ``"shifted"``.
         database (ExpertDatabase, optional): where a shifted placement looks up the target's
             episode; without it the target itself stands in.
+        relative (bool, optional): the networks see the states after the current one as changes from
+            it, in units of the changes that the level's grid meets in the data (``changes``, see
+            :func:`fit_scales`), rather than as standardised states. One step changes a robot's
+            state by a small part of its deviation. Defaults to ``False``.
         in_keys, out_keys (sequence of NestedKey, optional): new names, in the order of the table.
 
     Raises:
@@ -100,22 +105,29 @@ class DiffuserLitePlanner(Planner):
         blocks: int = 2,
         process: Literal["flow", "diffusion", "ancestral"] = "flow",
         steps: int = 3,
-        temperature: float = 1.0,
+        temperature: float | Sequence[float] = 1.0,
         candidates: int = 1,
         return_model: ReturnModel | None = None,
         noise: Noise = "sample",
         targets: bool = True,
         placement: str = "shifted",
         database: ExpertDatabase | None = None,
+        relative: bool = False,
         in_keys: Sequence[NestedKey] | None = None,
         out_keys: Sequence[NestedKey] = ("plan", "action"),
     ):
         levels = plan_levels(horizon, jumps)
+        each = temperature if isinstance(temperature, Sequence) else [temperature] * len(levels)
+        if len(each) != len(levels):
+            raise ValueError(
+                f"temperature is {list(each)}; expected one number, or one for each of the "
+                f"{len(levels)} levels."
+            )
         super().__init__(
             normalizer,
             make_process(process),
             steps,
-            temperature,
+            each,
             candidates,
             return_model,
             noise,
@@ -137,6 +149,9 @@ class DiffuserLitePlanner(Planner):
         self.networks = PlanNetworks(
             DiT(state_dim, level.tokens, width, heads, blocks) for level in self.levels
         )
+        self.changes: nn.ModuleList | None = None
+        if relative:
+            self.changes = nn.ModuleList(Normalizer.identity(state_dim) for _ in levels)
         self.register_buffer("plan_times", plan_times(levels), persistent=False)
 
     def decide(self, state: Tensor, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
@@ -207,19 +222,22 @@ class DiffuserLitePlanner(Planner):
         copies = self.candidates if number == 0 else 1
         many, many_mask = known.repeat_interleave(copies, 0), mask.repeat_interleave(copies, 0)
         given = network.prepare(many_mask)
+        change = None if self.changes is None else self.changes[number]
         free = self.levels[number].free(number)
         sample = sample_plan(
             self.process,
             lambda x, step: network(x, given, step, free),
-            self._noise(len(state), copies, tokens, generator, state),
-            self.normalizer(many),
+            self.temperatures[number] * self._draw(len(state), copies, tokens, generator, state),
+            encode_states(many, self.normalizer, change),
             many_mask,
             self.steps,
             free,
             fresh=lambda: self._draw(len(state), copies, tokens, generator, state),
         )
         # exact in raw units: what is known is not sent through the normaliser and back
-        raw = torch.where(many_mask, many, self.normalizer.inverse(sample))
+        raw = torch.where(
+            many_mask, many, decode_states(sample, many[:, :1], self.normalizer, change)
+        )
         if copies == 1:
             return raw
         assert self.return_model is not None

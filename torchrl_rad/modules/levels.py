@@ -9,7 +9,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-__all__ = ["Level", "plan_levels", "plan_times"]
+from torchrl_rad.modules.normalizer import Normalizer
+
+__all__ = ["Level", "decode_states", "encode_states", "level_changes", "plan_levels", "plan_times"]
 
 
 class Level(NamedTuple):
@@ -58,3 +60,58 @@ def plan_times(levels: Sequence[Level]) -> Tensor:
     for level in reversed(levels[:-1]):
         times = torch.cat([times, torch.arange(2, level.tokens) * level.jump])
     return times
+
+
+def encode_states(states: Tensor, normalizer: Normalizer, change: Normalizer | None) -> Tensor:
+    """Planned states [*B, n, S] in a network's units.
+
+    Args:
+        states (Tensor): raw units; the first one is the current state.
+        normalizer (Normalizer): of states.
+        change (Normalizer, optional): of changes from the current state, as which all states but
+            that one are given then.
+
+    Examples:
+        >>> plan = torch.tensor([[3.0], [3.5], [4.0]])
+        >>> change = Normalizer(torch.zeros(1), torch.tensor([0.5]))
+        >>> encode_states(plan, Normalizer.identity(1), change).squeeze()
+        tensor([3., 1., 2.])
+    """
+    if change is None:
+        return normalizer(states)
+    now = states[..., :1, :]
+    return torch.cat([normalizer(now), change(states[..., 1:, :] - now)], -2)
+
+
+def decode_states(
+    units: Tensor, now: Tensor, normalizer: Normalizer, change: Normalizer | None
+) -> Tensor:
+    """The way back of :func:`encode_states`, ``now`` [*B, 1, S] being the current state."""
+    if change is None:
+        return normalizer.inverse(units)
+    return torch.cat([now, change.inverse(units[..., 1:, :]) + now], -2)
+
+
+def level_changes(states: Tensor, episode: Tensor, level: Level) -> Normalizer:
+    """The scale of the changes from the first state of a level to the others, in recorded steps.
+
+    It is the root of the mean square, not a deviation about the mean: to stay counts as 0.
+
+    Args:
+        states (Tensor): [T, S], raw units, whole episodes one after the other.
+        episode (Tensor): int64 [T].
+        level (Level): whose grid it is.
+
+    Examples:
+        >>> states = torch.tensor([[0.0], [1.0], [3.0], [9.0]])
+        >>> level_changes(states, torch.tensor([0, 0, 0, 1]), Level(jump=1, tokens=2)).deviation
+        tensor([1.5811])
+    """
+    squares, count = torch.zeros(states.shape[-1], dtype=torch.float64), 0
+    for ahead in range(level.jump, level.span + 1, level.jump):
+        within = episode[:-ahead] == episode[ahead:]
+        change = (states[ahead:] - states[:-ahead])[within].double()
+        squares += change.square().sum(0).cpu()
+        count += len(change)
+    scale = (squares / max(1, count)).sqrt()
+    return Normalizer(torch.zeros_like(scale), scale)

@@ -58,6 +58,11 @@ class TargetPlacement:
             raise ValueError(f"placement is {name!r}; expected one of {PLACEMENTS}.")
         self.name = name
 
+    @property
+    def first_only(self) -> bool:
+        """Whether finer levels never hold a target, so that they are the backbone's."""
+        return self.name == "shifted_first"
+
     def __call__(self, step: Tensor, level: int, jump: int, tokens: int) -> Placement:
         up = jump - 1 if self.name == "next" else jump // 2
         token = ((step + up) // jump).clamp(1, tokens - 1)

@@ -78,7 +78,7 @@ class Planner(TensorDictModuleBase):
         normalizer (Normalizer): of states.
         process (Process): the generative process.
         steps (int): calls of the network a level.
-        temperature (float): scale of the initial noise.
+        temperatures (sequence of float): scale of the initial noise of each level.
         candidates (int): plans a row, of which the return model keeps the best.
         return_model (nn.Module, optional): J.
         noise (str): ``"sample"``, ``"seeded"`` or ``"zero"``.
@@ -96,7 +96,7 @@ class Planner(TensorDictModuleBase):
         normalizer: Normalizer,
         process: Process,
         steps: int,
-        temperature: float,
+        temperatures: Sequence[float],
         candidates: int,
         return_model: nn.Module | None,
         noise: Noise,
@@ -105,7 +105,7 @@ class Planner(TensorDictModuleBase):
         out_keys: Sequence[NestedKey],
     ):
         super().__init__()
-        _check(steps, temperature, candidates, return_model, noise)
+        _check(steps, temperatures, candidates, return_model, noise)
         read = ["observation", "target", "found", "target_step", "target_index"]
         self.in_keys = list(in_keys) if in_keys is not None else read if targets else read[:1]
         self.out_keys = list(out_keys)
@@ -114,7 +114,7 @@ class Planner(TensorDictModuleBase):
                 f"in_keys are {self.in_keys} and out_keys {self.out_keys}; expected "
                 f"{'five' if targets else 'one'} and two, in the order of the table."
             )
-        self.process, self.steps, self.temperature = process, steps, temperature
+        self.process, self.steps, self.temperatures = process, steps, list(temperatures)
         self.candidates, self.noise, self.targets = candidates, noise, targets
         self.normalizer, self.return_model = normalizer, return_model
         self._frozen = FrozenCache()
@@ -195,12 +195,6 @@ class Planner(TensorDictModuleBase):
         noise = torch.randn((copies, *shape[1:]), generator=generator, device=like.device)
         return noise.repeat(rows, 1, 1)
 
-    def _noise(
-        self, rows: int, copies: int, tokens: int, generator: torch.Generator | None, like: Tensor
-    ) -> Tensor:
-        """The noise that a plan begins as."""
-        return self.temperature * self._draw(rows, copies, tokens, generator, like)
-
 
 def best_plans(plans: Tensor, returns: Tensor) -> Tensor:
     """The plan of each row with the largest return [Q, C]: [Q, C, n, D] -> [Q, n, D]."""
@@ -208,13 +202,17 @@ def best_plans(plans: Tensor, returns: Tensor) -> Tensor:
 
 
 def _check(
-    steps: int, temperature: float, candidates: int, return_model: nn.Module | None, noise: str
+    steps: int,
+    temperatures: Sequence[float],
+    candidates: int,
+    return_model: nn.Module | None,
+    noise: str,
 ) -> None:
     """Raises ValueError for arguments of a planner that they cannot have."""
     if steps < 1:
         raise ValueError(f"steps is {steps}; a plan needs at least one inference step.")
-    if temperature < 0:
-        raise ValueError(f"temperature is {temperature}; it must not be negative.")
+    if min(temperatures) < 0:
+        raise ValueError(f"temperature is {min(temperatures)}; it must not be negative.")
     if candidates < 1 or (candidates > 1 and return_model is None):
         raise ValueError(
             f"candidates is {candidates}: expected 1, or more and a return_model to rank them."

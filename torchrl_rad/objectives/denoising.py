@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -12,6 +13,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 
 from torchrl_rad.modules.diffuser_lite import DiffuserLitePlanner
+from torchrl_rad.modules.levels import encode_states
 from torchrl_rad.modules.planner import PlanNetworks
 from torchrl_rad.objectives.common import (
     KeyedLoss,
@@ -50,6 +52,7 @@ class DenoisingLoss(KeyedLoss):
             Defaults to a random one.
         next_weight (float, optional): weight of grid point 1. Defaults to ``10.0``
             (DiffuserLite's).
+        only (sequence of int, optional): levels to train, if not all.
         delay (bool, optional): keep target parameters, for :class:`torchrl.objectives.SoftUpdate`.
             Defaults to ``False``.
         reduction (str, optional): ``"none"``, ``"mean"`` or ``"sum"`` over windows. Defaults to
@@ -93,6 +96,7 @@ class DenoisingLoss(KeyedLoss):
         no_target: float = 0.2,
         pseudo_step: int | None = None,
         next_weight: float = 10.0,
+        only: Sequence[int] | None = None,
         delay: bool = False,
         reduction: Literal["none", "mean", "sum"] | None = None,
     ):
@@ -100,10 +104,15 @@ class DenoisingLoss(KeyedLoss):
         check_share(no_target)
         check_step(pseudo_step, planner.horizon)
         self.convert_to_functional(planner.networks, "network", create_target_params=delay)
-        self.planner_normalizer = planner.normalizer
+        self.planner_normalizer, self.planner_changes = planner.normalizer, planner.changes
         self.levels, self.horizon = planner.levels, planner.horizon
         self.process, self.placement = planner.process, planner.placement
-        self._out_keys = ["loss_denoising", *(f"level_{n}" for n in range(len(self.levels)))]
+        self.numbers = list(range(len(self.levels)) if only is None else only)
+        if not self.numbers or not set(self.numbers) <= set(range(len(self.levels))):
+            raise ValueError(
+                f"only is {self.numbers}; these plans have levels 0 to {len(self.levels) - 1}."
+            )
+        self._out_keys = ["loss_denoising", *(f"level_{n}" for n in self.numbers)]
         self.no_target = no_target if planner.targets else 1.0
         self.pseudo_step, self.next_weight = pseudo_step, next_weight
         self.reduction = "mean" if reduction is None else reduction
@@ -126,12 +135,11 @@ class DenoisingLoss(KeyedLoss):
         masks, counted = window_masks(self._loss_mask_keys(), tensordict, shape)
         if counted is not None:  # what is masked may be NaN, also in the backward pass
             windows = torch.where(counted[..., None, None], windows, 0.0)
-        windows = self.planner_normalizer(windows.reshape(-1, *windows.shape[-2:]))
+        windows = windows.reshape(-1, *windows.shape[-2:])
         with self.network_params.to_module(self.network):
-            levels = range(len(self.levels))
-            losses = [self._level(number, windows).reshape(shape) for number in levels]
+            losses = [self._level(number, windows).reshape(shape) for number in self.numbers]
         out = {"loss_denoising": self._reduce_loss(torch.stack(losses).sum(0), masks)}
-        for number, value in enumerate(losses):
+        for number, value in zip(self.numbers, losses, strict=True):
             out[f"level_{number}"] = self._reduce_loss(value.detach(), masks, reduction="mean")
         out = TensorDict(out)
         self._clear_weakrefs(tensordict, out, "network_params", "target_network_params")
@@ -140,6 +148,8 @@ class DenoisingLoss(KeyedLoss):
     def _level(self, number: int, windows: Tensor) -> Tensor:
         """Loss of each window [B] on one level."""
         clean, mask = self.pieces(number, windows)
+        change = None if self.planner_changes is None else self.planner_changes[number]
+        clean = encode_states(clean, self.planner_normalizer, change)
         time = torch.rand(len(clean), device=clean.device)
         noise = torch.randn_like(clean)
         noisy = torch.where(mask, clean, self.process.corrupt(clean, noise, time[:, None, None]))
