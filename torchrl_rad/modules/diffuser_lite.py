@@ -14,7 +14,13 @@ from torchrl_rad.data.database import ExpertDatabase
 from torchrl_rad.modules.dit import DiT
 from torchrl_rad.modules.frozen import StepNetwork
 from torchrl_rad.modules.inverse import InverseDynamics
-from torchrl_rad.modules.levels import decode_states, encode_states, plan_levels, plan_times
+from torchrl_rad.modules.levels import (
+    change_of,
+    decode_states,
+    encode_states,
+    plan_levels,
+    plan_times,
+)
 from torchrl_rad.modules.normalizer import Normalizer
 from torchrl_rad.modules.placement import TargetPlacement
 from torchrl_rad.modules.planner import Noise, Pin, Planner, PlanNetworks, best_plans
@@ -222,7 +228,7 @@ class DiffuserLitePlanner(Planner):
         copies = self.candidates if number == 0 else 1
         many, many_mask = known.repeat_interleave(copies, 0), mask.repeat_interleave(copies, 0)
         given = network.prepare(many_mask)
-        change = None if self.changes is None else self.changes[number]
+        change = change_of(self.changes, number)
         free = self.levels[number].free(number)
         sample = sample_plan(
             self.process,

@@ -4,14 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import pairwise
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from torchrl_rad.modules.normalizer import Normalizer
 
-__all__ = ["Level", "decode_states", "encode_states", "level_changes", "plan_levels", "plan_times"]
+__all__ = [
+    "Level",
+    "change_of",
+    "decode_states",
+    "encode_states",
+    "level_changes",
+    "plan_levels",
+    "plan_times",
+]
 
 
 class Level(NamedTuple):
@@ -60,6 +68,11 @@ def plan_times(levels: Sequence[Level]) -> Tensor:
     for level in reversed(levels[:-1]):
         times = torch.cat([times, torch.arange(2, level.tokens) * level.jump])
     return times
+
+
+def change_of(changes: nn.ModuleList | None, number: int) -> Normalizer | None:
+    """The scale of one level's changes; None where plans are not relative."""
+    return None if changes is None else cast(Normalizer, changes[number])
 
 
 def encode_states(states: Tensor, normalizer: Normalizer, change: Normalizer | None) -> Tensor:

@@ -13,7 +13,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 
 from torchrl_rad.modules.diffuser_lite import DiffuserLitePlanner
-from torchrl_rad.modules.levels import encode_states
+from torchrl_rad.modules.levels import change_of, encode_states
 from torchrl_rad.modules.planner import PlanNetworks
 from torchrl_rad.objectives.common import (
     KeyedLoss,
@@ -148,7 +148,7 @@ class DenoisingLoss(KeyedLoss):
     def _level(self, number: int, windows: Tensor) -> Tensor:
         """Loss of each window [B] on one level."""
         clean, mask = self.pieces(number, windows)
-        change = None if self.planner_changes is None else self.planner_changes[number]
+        change = change_of(self.planner_changes, number)
         clean = encode_states(clean, self.planner_normalizer, change)
         time = torch.rand(len(clean), device=clean.device)
         noise = torch.randn_like(clean)
