@@ -12,7 +12,7 @@ import pytest
 ROOT = Path(__file__).parents[1]
 FILES = sorted((ROOT / "benchmarks").glob("test_*.py"))
 LARGER = "100k 1M 17d 29d 60d k500 q50 c4 c16 c64 b4 b16 b50 b64 b128 h129".split()
-LARGER += "bf16 fp16 hopper antmaze".split()
+LARGER += "bf16 fp16 hopper antmaze s20".split()
 
 
 def functions(tree):
