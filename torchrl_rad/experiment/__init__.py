@@ -16,6 +16,7 @@ from torchrl_rad.experiment.policies import (
     saved_maze,
     saved_task,
     share_weights,
+    take_weights,
 )
 from torchrl_rad.experiment.recipe import (
     MakeObjectives,
@@ -51,6 +52,7 @@ __all__ = [
     "saved_maze",
     "saved_task",
     "share_weights",
+    "take_weights",
     "step_error",
     "step_objective",
     "task_dataset",

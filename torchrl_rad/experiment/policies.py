@@ -11,7 +11,7 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictSequential
 from torchrl.data import LazyTensorStorage
 
-from torchrl_rad.checkpoint import CheckpointError, read_json
+from torchrl_rad.checkpoint import CheckpointError, load_weights, read_json
 from torchrl_rad.data.database import ExpertDatabase
 from torchrl_rad.data.experts import expert_from_config
 from torchrl_rad.envs.maze import MazeTask
@@ -29,6 +29,7 @@ __all__ = [
     "saved_maze",
     "saved_task",
     "share_weights",
+    "take_weights",
 ]
 
 BACKBONE = "backbone"
@@ -120,6 +121,27 @@ def share_weights(policies: Mapping[str, PolicyParts], trained: str) -> None:
                 own.return_model.load_state_dict(given.return_model.state_dict())
         elif name != trained:
             parts.policy.load_state_dict(source.state_dict())
+
+
+def take_weights(policies: Mapping[str, PolicyParts], folder: str | Path) -> None:
+    """Gives the trained weights of another run to these policies, which may retrieve otherwise.
+
+    Args:
+        policies (mapping): of :func:`make_policies`, with planners of the same sizes.
+        folder (path): the run folder.
+
+    Raises:
+        CheckpointError: there are no such weights, or they are of other sizes.
+    """
+    saved = Path(folder) / "policies"
+    with_targets = sorted(path.parent for path in saved.glob("*/policy.json"))
+    with_targets = [path for path in with_targets if path.name != BACKBONE]
+    if not with_targets:
+        raise CheckpointError(f"{folder} holds no trained policy with targets: give a run folder.")
+    trained = next(name for name in policies if name != BACKBONE)
+    load_weights(saved / BACKBONE, "weights", policies[BACKBONE].policy)
+    load_weights(with_targets[0], "weights", policies[trained].policy)
+    share_weights(policies, trained)
 
 
 def saved_task(folder: str | Path) -> Task:

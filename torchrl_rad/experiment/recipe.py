@@ -17,7 +17,13 @@ from torchrl.record.loggers import get_logger
 from torchrl_rad.checkpoint import Checkpointer, CheckpointError, state_digest
 from torchrl_rad.envs.maze import MazeTask
 from torchrl_rad.experiment.data import check_data, make_data, resolve_dataset, window_sampler
-from torchrl_rad.experiment.policies import BACKBONE, PolicyParts, make_policies, share_weights
+from torchrl_rad.experiment.policies import (
+    BACKBONE,
+    PolicyParts,
+    make_policies,
+    share_weights,
+    take_weights,
+)
 from torchrl_rad.experiment.scoring import evaluate_policies
 from torchrl_rad.learned_value import learn_value
 from torchrl_rad.modules.step import StepEstimator
@@ -32,6 +38,7 @@ __all__ = [
     "MakeObjectives",
     "make_logger",
     "run_recipe",
+    "save_policies",
     "step_objective",
     "train_policies",
 ]
@@ -95,7 +102,7 @@ def train_policies(
     make_objectives: MakeObjectives,
     resume: bool,
 ) -> None:
-    """Trains, puts the averaged weights into all policies and saves these."""
+    """Trains and puts the averaged weights into all policies."""
     trained = next(name for name in policies if name != BACKBONE)
     objectives = make_objectives(cfg, policies, trained)
     logger, settings = make_logger(run, cfg), cfg["logger"]
@@ -122,6 +129,10 @@ def train_policies(
         loss = objectives[name].loss
         loss.network_params.data.update_(loss.target_network_params.data)
     share_weights(policies, trained)
+
+
+def save_policies(run: RunFolder, cfg: dict[str, Any], policies: Mapping[str, PolicyParts]) -> None:
+    """Into the run folder's ``policies``."""
     for name, parts in policies.items():
         about = {"task": cfg["env"]["name"], "env": cfg["env"], "seed": cfg["seed"]}
         save_policy(
@@ -157,11 +168,15 @@ def _whole_run(
                 advice = f"retrieval.{name}.expert='{{rule: top_share_by_return, args: [0.1]}}'"
                 print(f"WARNING: {name}'s rule keeps every episode; choose by {advice}", flush=True)
     data = data.to(cfg["device"]) if cfg["device"] != "cpu" else data
-    if cfg["loss"]["value"] == "iql":
+    if cfg["loss"]["value"] == "iql" and not cfg.get("weights"):
         data["value"] = learn_value(run, cfg, data, task.over(data))
-    train_policies(run, cfg, policies, data, make_objectives, resume)
+    if cfg.get("weights"):
+        take_weights(policies, cfg["weights"])
+    else:
+        train_policies(run, cfg, policies, data, make_objectives, resume)
+        plot_curves(run.metrics.rows(), run.path / "curves.png")
+    save_policies(run, cfg, policies)
     rows, episodes = evaluate_policies(run, cfg, task, policies, data)
-    plot_curves(run.metrics.rows(), run.path / "curves.png")
     titles = {name: f"{name}: {rows[name]['score']:.0f}" for name in rows}
     plain = {name: parts.policy for name, parts in policies.items()}
     if isinstance(task, MazeTask):
