@@ -24,10 +24,12 @@ from torchrl_rad.experiment import (
     make_policies,
     policy_row,
     restrict,
+    save_policies,
     saved_maze,
     saved_task,
     share_weights,
     step_error,
+    take_weights,
     window_sampler,
 )
 from torchrl_rad.runs import RunFolder
@@ -256,6 +258,30 @@ def test_finer_levels_without_targets_are_the_backbones(data):
         torch.equal(v, given[1].state_dict()[k]) for k, v in backbone[1].state_dict().items()
     )
     assert all(torch.equal(v, own[k]) for k, v in backbone[0].state_dict().items())
+
+
+def test_weights_of_another_run(tmp_path, policies, data):
+    share_weights(policies, "paper")
+    run = RunFolder.create(tmp_path / "run", CONFIG)
+    save_policies(run, CONFIG, policies)
+    torch.manual_seed(1)
+    anyone = {**RETRIEVAL["followed"], "target": {"rule": "random"}}
+    others = make_policies(NETWORK, {"random": anyone, "followed": RETRIEVAL["followed"]}, data)
+    take_weights(others, run.path)
+    for name, source in ((BACKBONE, BACKBONE), ("random", "paper"), ("followed", "paper")):
+        given = policies[source].policy[-1].state_dict()
+        found = others[name].policy[-1].state_dict()
+        assert all(torch.equal(value, given[key]) for key, value in found.items()), name
+
+
+def test_no_weights_to_take(tmp_path, policies, data):
+    with pytest.raises(CheckpointError, match="holds no trained policy with targets: give a run"):
+        take_weights(policies, tmp_path)
+    run = RunFolder.create(tmp_path / "run", CONFIG)
+    save_policies(run, CONFIG, policies)
+    wider = make_policies({**NETWORK, "width": 32}, RETRIEVAL, data)
+    with pytest.raises(CheckpointError, match="does not fit this module"):
+        take_weights(wider, run.path)
 
 
 def test_step_error_by_hand(policies, monkeypatch):

@@ -110,6 +110,18 @@ def test_policies_load(whole):
         assert torch.equal(value, inverse[key]), key
 
 
+def test_weights_of_a_run_give_its_figures_without_a_training(tmp_path, whole):
+    run, _ = whole
+    folder = tmp_path / "again"
+    code, _, err = call("dl_rad.py", *SMALL, f"weights={run.path}", f"folder={folder}")
+    assert code == 0, err
+    again = RunFolder.open(folder)
+    for name in POLICIES:
+        same, found = run.load_episodes(name), again.load_episodes(name)
+        assert torch.equal(found["observation"], same["observation"]), name
+    assert not (folder / "checkpoints").exists() and not (folder / "curves.png").exists()
+
+
 def test_evaluate_gives_the_figures_of_the_run(whole):
     run, _ = whole
     folder = run.path / "policies" / "followed"
