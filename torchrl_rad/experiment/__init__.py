@@ -2,6 +2,7 @@
 
 from torchrl_rad.experiment.data import (
     check_data,
+    describe_windows,
     make_data,
     resolve_dataset,
     restrict,
@@ -39,6 +40,7 @@ __all__ = [
     "MakeObjectives",
     "PolicyParts",
     "check_data",
+    "describe_windows",
     "collect_episodes",
     "evaluate_policies",
     "load_starts",

@@ -21,6 +21,7 @@ from torchrl_rad.envs.tasks import make_task
 
 __all__ = [
     "check_data",
+    "describe_windows",
     "make_data",
     "resolve_dataset",
     "restrict",
@@ -100,6 +101,24 @@ def check_data(task: Task, data: TensorDictBase) -> DataReport:
     if not found.ok:
         raise ValueError(f"the data cannot be trained on:\n{found}")
     return found
+
+
+def describe_windows(data: TensorDictBase, horizon: int) -> str:
+    """How many windows there are to train on, and which share of the episodes is too short.
+
+    Examples:
+        >>> from tensordict import TensorDict
+        >>> describe_windows(TensorDict({"episode": torch.tensor([0, 0, 0, 1])}, [4]), horizon=2)
+        'windows of 2 steps: 2, in 1 of 2 episodes; the other 1 (25.0% of the steps) are shorter'
+    """
+    lengths = episode_lengths(data)
+    long = lengths >= horizon
+    count, short = int((lengths[long] - horizon + 1).sum()), int((~long).sum())
+    text = f"windows of {horizon} steps: {count}, in {int(long.sum())} of {len(lengths)} episodes"
+    if short:
+        share = int(lengths[~long].sum()) / len(data)
+        text += f"; the other {short} ({share:.1%} of the steps) are shorter"
+    return text
 
 
 def window_sampler(data: TensorDictBase, horizon: int, batch_size: int):

@@ -16,7 +16,13 @@ from torchrl.record.loggers import get_logger
 
 from torchrl_rad.checkpoint import Checkpointer, CheckpointError, state_digest
 from torchrl_rad.envs.maze import MazeTask
-from torchrl_rad.experiment.data import check_data, make_data, resolve_dataset, window_sampler
+from torchrl_rad.experiment.data import (
+    check_data,
+    describe_windows,
+    make_data,
+    resolve_dataset,
+    window_sampler,
+)
 from torchrl_rad.experiment.policies import (
     BACKBONE,
     PolicyParts,
@@ -156,6 +162,7 @@ def _whole_run(
     print(f"run folder: {run.path}\ndata: {cfg['replay_buffer']['dataset']}", flush=True)
     task, data = make_data(cfg)
     print(check_data(task, data), flush=True)
+    print(describe_windows(data, cfg["network"]["horizon"]), flush=True)
     policies = make_policies(cfg["network"], cfg["retrieval"], data)
     for parts in policies.values():
         parts.policy.to(cfg["device"])
