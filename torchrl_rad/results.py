@@ -31,6 +31,7 @@ COLUMNS = {  # key: (heading, format)
     "TS": ("TS ms", "{}"),
     "SE": ("SE ms", "{}"),
     "PL": ("PL ms", "{}"),
+    "rollout_s": ("rollout s", "{:.0f}"),
     "seeds": ("score of each seed", "{}"),
 }
 

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Mapping
 from typing import Any
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictSequential
+from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 from torchrl.envs import EnvBase
 from tqdm import tqdm
 
@@ -16,6 +17,7 @@ from torchrl_rad.envs.task import Task
 from torchrl_rad.evaluation import episode_results, evaluate, measure_latency, summarise
 from torchrl_rad.experiment.data import window_sampler
 from torchrl_rad.experiment.policies import BACKBONE, PolicyParts
+from torchrl_rad.modules.replanning import with_replanning
 from torchrl_rad.objectives.step import draw_step_pairs
 from torchrl_rad.precision import planning_dtype
 from torchrl_rad.results import write_results
@@ -40,7 +42,7 @@ PARTS = {  # what stands in their columns
 
 def collect_episodes(
     env: EnvBase,
-    policy: TensorDictSequential,
+    policy: TensorDictModuleBase,
     max_steps: int,
     seed: int,
     name: str = "policy",
@@ -51,7 +53,7 @@ def collect_episodes(
 
     Args:
         env (EnvBase): [n] rows, as of :meth:`~torchrl_rad.envs.Task.make_env`.
-        policy (TensorDictSequential): what acts.
+        policy (TensorDictModuleBase): what acts.
         max_steps (int): limit of an episode.
         seed (int): of the start states and of the policy's noise.
         name (str, optional): shown beside the progress bar.
@@ -114,6 +116,7 @@ def evaluate_policies(
     windows = window_sampler(data, cfg["network"]["horizon"], 4096)()
     rows: dict[str, dict[str, Any]] = {}
     episodes: dict[str, TensorDictBase] = {}
+    seconds: dict[str, float] = {}
     env = None  # a maze costs some 13 MB a row: one environment serves all policies
     for name, parts in policies.items():
         steps = run.load_episodes(name)
@@ -122,12 +125,16 @@ def evaluate_policies(
             if env is None:
                 env = task.make_env(settings["episodes"], starts=load_starts(settings["starts"]))
             dtype = planning_dtype(cfg["optim"]["precision"], cfg["device"])
-            steps = collect_episodes(
-                env, parts.policy, task.max_steps, seed, name, dtype, progress=progress
-            )
+            policy: TensorDictModuleBase = parts.policy
+            if settings.get("replan", 1) > 1:
+                policy = with_replanning(parts.policy, settings["replan"])
+            begin = time.perf_counter()
+            steps = collect_episodes(env, policy, task.max_steps, seed, name, dtype, progress)
+            seconds[name] = time.perf_counter() - begin
             run.save_episodes(name, steps)
         episodes[name] = steps
         rows[name] = policy_row(task, parts.policy, steps)
+        rows[name]["rollout_s"] = seconds.get(name)  # of all episodes, side by side
         if name != BACKBONE:
             torch.manual_seed(settings["seed"])  # the same pairs for each policy, and when resumed
             recorded = parts.policy[1].estimate == "recorded"

@@ -14,6 +14,7 @@ from torchrl_rad.modules.process import (
     RectifiedFlow,
     make_process,
 )
+from torchrl_rad.modules.replanning import PlanActions, with_replanning
 from torchrl_rad.modules.return_model import ReturnModel
 from torchrl_rad.modules.sampling import Guidance, sample_plan
 from torchrl_rad.modules.step import StepEstimator
@@ -31,6 +32,7 @@ __all__ = [
     "InverseDynamics",
     "NoisyReturnModel",
     "Normalizer",
+    "PlanActions",
     "PlainTargetModule",
     "RectifiedFlow",
     "RetrievalTargetModule",
@@ -42,4 +44,5 @@ __all__ = [
     "make_process",
     "plan_levels",
     "sample_plan",
+    "with_replanning",
 ]
