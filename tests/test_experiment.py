@@ -182,6 +182,12 @@ def test_faults_are_named(data):
     assert "action" in str(caught.value) and "episode 2" in str(caught.value)
 
 
+def test_data_of_another_environment(data):
+    hopper = make_task({"name": "hopper", "family": "locomotion", "env_id": "Hopper-v5"})
+    with pytest.raises(ValueError, match=r"of widths \(4, 2\), but hopper has \(11, 3\)"):
+        check_data(hopper, data)
+
+
 def test_database(data):
     database = make_database(data, RETRIEVAL["paper"])
     assert database.gamma == 0.997

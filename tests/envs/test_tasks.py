@@ -61,6 +61,11 @@ def test_starts_depend_on_the_seed_alone(settings):
 
 
 @families
+def test_widths(settings):
+    assert make_task(settings).widths() == SIZES[settings["name"]]
+
+
+@families
 def test_no_rows(settings):
     with pytest.raises(ValueError, match="rows is 0; an environment has at least one row"):
         make_task(settings).make_env(0)

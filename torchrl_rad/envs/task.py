@@ -44,6 +44,15 @@ class Task(ABC):
     def make_row(self, number: int, starts: Any = None) -> gym.Env:
         """The environment of one row, whose observation is the state."""
 
+    def widths(self) -> tuple[int, int]:
+        """Of the states and actions of the environment."""
+        env: Any = self.make_row(0)
+        space = env.observation_space
+        state = space["observation"] if isinstance(space, gym.spaces.Dict) else space
+        widths = state.shape[-1], env.action_space.shape[-1]
+        env.close()
+        return widths
+
     def starts(self) -> Tensor | None:
         """Where episodes begin, [n, 2 or more], if that is known beforehand."""
         return None

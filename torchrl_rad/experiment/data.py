@@ -95,8 +95,14 @@ def check_data(task: Task, data: TensorDictBase) -> DataReport:
     """A report on the data against the task's starts.
 
     Raises:
-        ValueError: it has faults; the message names them.
+        ValueError: it has faults, which the message names, or is of another environment.
     """
+    came, expected = (data["observation"].shape[-1], data["action"].shape[-1]), task.widths()
+    if came != expected:
+        raise ValueError(
+            f"the data has observations and actions of widths {came}, but {task.name} has "
+            f"{expected}: it is of another environment. Name another replay_buffer.dataset."
+        )
     found = report(data, starts=task.starts())
     if not found.ok:
         raise ValueError(f"the data cannot be trained on:\n{found}")
