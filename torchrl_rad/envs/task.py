@@ -48,7 +48,7 @@ class Task(ABC):
         """Of the states and actions of the environment."""
         env: Any = self.make_row(0)
         space = env.observation_space
-        state = space["observation"] if isinstance(space, gym.spaces.Dict) else space
+        state: Any = space["observation"] if isinstance(space, gym.spaces.Dict) else space
         widths = state.shape[-1], env.action_space.shape[-1]
         env.close()
         return widths
