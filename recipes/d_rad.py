@@ -14,8 +14,14 @@ import hydra
 from omegaconf import DictConfig, OmegaConf
 
 from torchrl_rad import Objective, SequenceDenoisingLoss, SequenceGuidanceLoss
-from torchrl_rad.experiment import BACKBONE, PolicyParts, run_recipe, step_objective
-from torchrl_rad.precision import uses_bf16
+from torchrl_rad.experiment import (
+    BACKBONE,
+    PolicyParts,
+    denoising_objective,
+    return_objective,
+    run_recipe,
+    step_objective,
+)
 
 
 def make_objectives(
@@ -23,16 +29,14 @@ def make_objectives(
 ) -> dict[str, Objective]:
     """L_d, L_e and L_g; L_d again for the backbone."""
     planner, backbone = (policies[name].policy[-1] for name in (trained, BACKBONE))
-    optim, loss, steps = cfg["optim"], cfg["loss"], cfg["optim"]["gradient_steps"]
+    loss = cfg["loss"]
     shared = {name: loss[name] for name in ("no_target", "pseudo_step")}
 
     def denoising(planner) -> Objective:
         module = SequenceDenoisingLoss(
             planner, action_weight=loss["next_weight"], delay=True, **shared
         )
-        rates = {name: optim[name] for name in ("lr", "warmup", "weight_decay", "ema")}
-        bf16 = uses_bf16(optim["precision"], cfg["device"])
-        return Objective(module, lambda windows: windows, steps=steps, bf16=bf16, **rates)
+        return denoising_objective(cfg, module)
 
     objectives = {
         "planner": denoising(planner),
@@ -41,10 +45,7 @@ def make_objectives(
     }
     if planner.return_model is not None:
         module = SequenceGuidanceLoss(planner, gamma=loss["gamma"], **shared)
-        if loss["value"] == "iql":
-            module.set_keys(value="value")
-        options = {"lr": optim["lr"], "warmup": optim["warmup"]}
-        objectives["return"] = Objective(module, lambda windows: windows, steps=steps, **options)
+        objectives["return"] = return_objective(cfg, module, cfg["optim"]["lr"])
     return objectives
 
 

@@ -20,8 +20,14 @@ from torchrl_rad import (
     ReturnGuidanceLoss,
     inverse_dynamics_actor,
 )
-from torchrl_rad.experiment import BACKBONE, PolicyParts, run_recipe, step_objective
-from torchrl_rad.precision import uses_bf16
+from torchrl_rad.experiment import (
+    BACKBONE,
+    PolicyParts,
+    denoising_objective,
+    return_objective,
+    run_recipe,
+    step_objective,
+)
 
 
 def make_objectives(
@@ -32,7 +38,6 @@ def make_objectives(
     backbone = policies[BACKBONE].policy[-1]
     optim, network, loss = cfg["optim"], cfg["network"], cfg["loss"]
     steps, head = optim["gradient_steps"], {"lr": optim["head_lr"], "warmup": optim["warmup"]}
-    bf16 = uses_bf16(optim["precision"], cfg["device"])
 
     def denoising(planner, only=None) -> Objective:
         module = DenoisingLoss(
@@ -43,9 +48,7 @@ def make_objectives(
             only=only,
             delay=True,
         )
-        names = ("lr", "warmup", "weight_decay", "ema")
-        options = {name: optim[name] for name in names}
-        return Objective(module, lambda windows: windows, steps=steps, bf16=bf16, **options)
+        return denoising_objective(cfg, module)
 
     objectives = {
         "planner": denoising(planner),
@@ -63,9 +66,7 @@ def make_objectives(
         module = ReturnGuidanceLoss(
             planner.return_model, jump=network["jumps"][0], gamma=loss["gamma"]
         )
-        if loss["value"] == "iql":
-            module.set_keys(value="value")
-        objectives["return"] = Objective(module, lambda windows: windows, steps=steps, **head)
+        objectives["return"] = return_objective(cfg, module, optim["head_lr"])
     return objectives
 
 

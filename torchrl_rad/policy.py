@@ -199,8 +199,9 @@ def fit_scales(policy: TensorDictSequential, data: TensorDictBase) -> None:
     if isinstance(planner, DiffuserLitePlanner):
         change = planner.inverse_dynamics.difference
         change.load_state_dict(_scale(following - now, change))
-        for level, scale in zip(planner.levels, planner.changes or (), strict=False):
-            scale.load_state_dict(level_changes(now, data["episode"], level).state_dict())
+        if planner.changes is not None:
+            for level, scale in zip(planner.levels, planner.changes, strict=True):
+                scale.load_state_dict(level_changes(now, data["episode"], level).state_dict())
     if planner.return_model is not None:
         planner.return_model.fit_scale(data["return_to_go"])
 

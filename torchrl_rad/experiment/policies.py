@@ -30,6 +30,7 @@ __all__ = [
     "saved_task",
     "share_weights",
     "take_weights",
+    "trained_name",
 ]
 
 BACKBONE = "backbone"
@@ -107,6 +108,11 @@ def make_policies(
     return policies
 
 
+def trained_name(policies: Mapping[str, PolicyParts]) -> str:
+    """The policy with targets that is trained for all of them."""
+    return next(name for name in policies if name != BACKBONE)
+
+
 def share_weights(policies: Mapping[str, PolicyParts], trained: str) -> None:
     """Gives the weights of one policy to all: all of them, or the backbone what knows no target."""
     source = policies[trained].policy
@@ -134,11 +140,11 @@ def take_weights(policies: Mapping[str, PolicyParts], folder: str | Path) -> Non
         CheckpointError: there are no such weights, or they are of other sizes.
     """
     saved = Path(folder) / "policies"
-    with_targets = sorted(path.parent for path in saved.glob("*/policy.json"))
-    with_targets = [path for path in with_targets if path.name != BACKBONE]
+    found = sorted(path.parent for path in saved.glob("*/policy.json"))
+    with_targets = [path for path in found if path.name != BACKBONE]
     if not with_targets:
         raise CheckpointError(f"{folder} holds no trained policy with targets: give a run folder.")
-    trained = next(name for name in policies if name != BACKBONE)
+    trained = trained_name(policies)
     load_weights(saved / BACKBONE, "weights", policies[BACKBONE].policy)
     load_weights(with_targets[0], "weights", policies[trained].policy)
     share_weights(policies, trained)

@@ -12,6 +12,7 @@ from typing import Any
 import torch
 from tensordict import TensorDictBase
 from torchrl._utils import logger as torchrl_logger
+from torchrl.objectives.common import LossModule
 from torchrl.record.loggers import get_logger
 
 from torchrl_rad.checkpoint import Checkpointer, CheckpointError, state_digest
@@ -29,6 +30,7 @@ from torchrl_rad.experiment.policies import (
     make_policies,
     share_weights,
     take_weights,
+    trained_name,
 )
 from torchrl_rad.experiment.scoring import evaluate_policies
 from torchrl_rad.learned_value import learn_value
@@ -36,13 +38,16 @@ from torchrl_rad.modules.step import StepEstimator
 from torchrl_rad.objectives.step import StepEstimationLoss, draw_step_pairs
 from torchrl_rad.plots import plot_curves, plot_targets
 from torchrl_rad.policy import save_policy
+from torchrl_rad.precision import uses_bf16
 from torchrl_rad.results import format_table
 from torchrl_rad.runs import RunFolder
 from torchrl_rad.training import Interrupted, Objective, train
 
 __all__ = [
     "MakeObjectives",
+    "denoising_objective",
     "make_logger",
+    "return_objective",
     "run_recipe",
     "save_policies",
     "step_objective",
@@ -86,6 +91,24 @@ def make_logger(run: RunFolder, cfg: Mapping[str, Any]) -> Callable[[int, dict[s
     return log
 
 
+def denoising_objective(cfg: Mapping[str, Any], loss: LossModule) -> Objective:
+    """L_d of a planner, with averaged weights, in bfloat16 where that is fast."""
+    optim = cfg["optim"]
+    rates = {name: optim[name] for name in ("lr", "warmup", "weight_decay", "ema")}
+    bf16 = uses_bf16(optim["precision"], cfg["device"])
+    steps = optim["gradient_steps"]
+    return Objective(loss, lambda windows: windows, steps=steps, bf16=bf16, **rates)
+
+
+def return_objective(cfg: Mapping[str, Any], loss: LossModule, lr: float) -> Objective:
+    """L_g, of recorded returns or of the learned value."""
+    if cfg["loss"]["value"] == "iql":
+        loss.set_keys(value="value")
+    optim = cfg["optim"]
+    steps, warmup = optim["gradient_steps"], optim["warmup"]
+    return Objective(loss, lambda windows: windows, lr=lr, steps=steps, warmup=warmup)
+
+
 def step_objective(cfg: Mapping[str, Any], estimator: StepEstimator) -> Objective:
     """L_e, on several pairs of states of each window."""
     optim, pairs = cfg["optim"], cfg["loss"]["step_pairs"]
@@ -109,7 +132,7 @@ def train_policies(
     resume: bool,
 ) -> None:
     """Trains and puts the averaged weights into all policies."""
-    trained = next(name for name in policies if name != BACKBONE)
+    trained = trained_name(policies)
     objectives = make_objectives(cfg, policies, trained)
     logger, settings = make_logger(run, cfg), cfg["logger"]
     planner = policies[trained].policy[-1]
@@ -175,11 +198,11 @@ def _whole_run(
                 advice = f"retrieval.{name}.expert='{{rule: top_share_by_return, args: [0.1]}}'"
                 print(f"WARNING: {name}'s rule keeps every episode; choose by {advice}", flush=True)
     data = data.to(cfg["device"]) if cfg["device"] != "cpu" else data
-    if cfg["loss"]["value"] == "iql" and not cfg.get("weights"):
-        data["value"] = learn_value(run, cfg, data, task.over(data))
     if cfg.get("weights"):
         take_weights(policies, cfg["weights"])
     else:
+        if cfg["loss"]["value"] == "iql":
+            data["value"] = learn_value(run, cfg, data, task.over(data))
         train_policies(run, cfg, policies, data, make_objectives, resume)
         plot_curves(run.metrics.rows(), run.path / "curves.png")
     save_policies(run, cfg, policies)

@@ -165,10 +165,10 @@ class DenoisingLoss(KeyedLoss):
 
         Args:
             number (int): the level.
-            windows (Tensor): [B, H, S].
+            windows (Tensor): [B, H, S], raw units.
 
         Returns:
-            States [B, n, S] and the mask of the known ones, bool [B, n, 1].
+            States [B, n, S], raw units, and the mask of the known ones, bool [B, n, 1].
         """
         level, count, device = self.levels[number], len(windows), windows.device
         rows = torch.arange(count, device=device)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from tensordict import TensorDict, TensorDictBase, TensorDictParams
@@ -11,10 +12,10 @@ from tensordict.nn import dispatch
 from tensordict.utils import NestedKey
 from torch import Tensor
 
-from torchrl_rad.modules.return_model import ReturnModel
+from torchrl_rad.modules.return_model import ReturnModel, ReturnScale
 from torchrl_rad.objectives.common import KeyedLoss, window_masks
 
-__all__ = ["ReturnGuidanceLoss", "plan_return"]
+__all__ = ["ReturnGuidanceLoss", "guidance_outputs", "plan_return", "return_target"]
 
 
 def plan_return(reward: Tensor, value: Tensor, gamma: float) -> Tensor:
@@ -37,6 +38,41 @@ def plan_return(reward: Tensor, value: Tensor, gamma: float) -> Tensor:
     length = reward.shape[-1]
     discount = gamma ** torch.arange(length, device=reward.device, dtype=torch.float32)
     return (reward[..., :-1] * discount[:-1]).sum(-1) + discount[-1] * value
+
+
+def return_target(
+    tensordict: TensorDictBase,
+    keys: Any,
+    shape: Sequence[int],
+    gamma: float,
+    counted: Tensor | None,
+) -> Tensor:
+    """C(tau) [*B] of windows of which not all count; the others' is 0.
+
+    Args:
+        tensordict (TensorDictBase): a loss's input.
+        keys: the loss's ``tensor_keys``, with ``reward`` and ``value``.
+        shape (sequence of int): [*B, H].
+        gamma (float): discount.
+        counted (Tensor, optional): bool [*B]. What is masked may be NaN.
+    """
+    reward, value = (tensordict[key].reshape(*shape) for key in (keys.reward, keys.value))
+    target = plan_return(reward, value[..., -1], gamma)
+    return target if counted is None else torch.where(counted, target, 0.0)
+
+
+def guidance_outputs(
+    loss: KeyedLoss, model: ReturnScale, predicted: Tensor, target: Tensor, masks: TensorDict
+) -> TensorDict:
+    """``loss_guidance`` and ``return_error`` of what ``model`` predicts, which is in its units."""
+    error = predicted - (target - model.mean) / model.deviation
+    error_in_returns = (error * model.deviation).abs().detach()
+    return TensorDict(
+        {
+            "loss_guidance": loss._reduce_loss(error.square(), masks),
+            "return_error": loss._reduce_loss(error_in_returns, masks, reduction="mean"),
+        }
+    )
 
 
 class ReturnGuidanceLoss(KeyedLoss):
@@ -116,23 +152,12 @@ class ReturnGuidanceLoss(KeyedLoss):
                 f"[*B, {horizon}, S]: {self.return_model.tokens} states, {self.jump} steps apart."
             )
         shape = states.shape[:-2]
-        reward = tensordict[self.tensor_keys.reward].reshape(*shape, horizon)
-        value = tensordict[self.tensor_keys.value].reshape(*shape, horizon)[..., -1]
         masks, counted = window_masks(self._loss_mask_keys(), tensordict, shape)
-        target = plan_return(reward, value, self.gamma)
+        target = return_target(tensordict, self.tensor_keys, (*shape, horizon), self.gamma, counted)
         if counted is not None:  # what is masked may be NaN, also in the backward pass
             states = torch.where(counted[..., None, None], states, 0.0)
-            target = torch.where(counted, target, 0.0)
         with self.return_model_params.to_module(self.return_model):
             predicted = self.return_model.standardised(states[..., :: self.jump, :])
-            unit, centre = self.return_model.deviation, self.return_model.mean
-        error = predicted - (target - centre) / unit
-        error_in_returns = (error * unit).abs().detach()
-        out = TensorDict(
-            {
-                "loss_guidance": self._reduce_loss(error.square(), masks),
-                "return_error": self._reduce_loss(error_in_returns, masks, reduction="mean"),
-            }
-        )
+            out = guidance_outputs(self, self.return_model, predicted, target, masks)
         self._clear_weakrefs(tensordict, out, "return_model_params")
         return out

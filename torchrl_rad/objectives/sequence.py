@@ -23,7 +23,7 @@ from torchrl_rad.objectives.common import (
     read_windows,
     window_masks,
 )
-from torchrl_rad.objectives.guidance import plan_return
+from torchrl_rad.objectives.guidance import guidance_outputs, return_target
 
 __all__ = ["SequenceDenoisingLoss", "SequenceGuidanceLoss", "draw_pins"]
 
@@ -305,22 +305,13 @@ class SequenceGuidanceLoss(_SequenceLoss):
             normalizer = self.return_model.normalizer
             windows, shape, masks, counted = self._windows(tensordict, normalizer)
             clean = self.return_model.normalised(windows)
-        reward = tensordict[self.tensor_keys.reward].reshape(*shape, self.horizon)
-        value = tensordict[self.tensor_keys.value].reshape(*shape, self.horizon)[..., -1]
-        target = plan_return(reward, value, self.gamma)
-        if counted is not None:
-            target = torch.where(counted, target, 0.0)
+        target = return_target(
+            tensordict, self.tensor_keys, (*shape, self.horizon), self.gamma, counted
+        )
         shown = _corrupt(self.process, clean, self.state_dim, self.no_target, self.pseudo_step)
         with self.return_model_params.to_module(self.return_model):
             predicted = self.return_model.standardised(shown.sample, shown.mask, shown.time)
-            unit, centre = self.return_model.deviation, self.return_model.mean
-        error = predicted.reshape(shape) - (target - centre) / unit
-        error_in_returns = (error * unit).abs().detach()
-        out = TensorDict(
-            {
-                "loss_guidance": self._reduce_loss(error.square(), masks),
-                "return_error": self._reduce_loss(error_in_returns, masks, reduction="mean"),
-            }
-        )
+            predicted = predicted.reshape(shape)
+            out = guidance_outputs(self, self.return_model, predicted, target, masks)
         self._clear_weakrefs(tensordict, out, "return_model_params")
         return out
