@@ -280,3 +280,13 @@ def test_package_that_is_not_installed(monkeypatch):
 
 if __name__ == "__main__":
     raise SystemExit(pytest.main([__file__]))
+
+
+def test_two_runs_do_not_write_one_folder(tmp_path):
+    run = RunFolder.create(tmp_path / "run", {})
+    with run.locked():
+        with pytest.raises(CheckpointError, match="another run is writing to .*run; wait"):
+            with RunFolder.open(run.path).locked():
+                raise AssertionError("both write")
+    with run.locked():  # free again
+        pass

@@ -39,6 +39,7 @@ from torchrl_rad._states import (
     set_state,
     state_digest,
 )
+from torchrl_rad.parallel import is_first
 
 __all__ = [
     "CheckpointError",
@@ -97,6 +98,8 @@ class Checkpointer:
         if keep < 1:
             raise ValueError(f"keep={keep}: at least one checkpoint must be kept.")
         self.folder, self.keep = Path(folder).absolute(), keep
+        if not is_first():  # of a process group the others read alone
+            return
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
             write_atomic(self.folder / f"{STAGE}probe", b"0")

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import csv
+import fcntl
 import io
 import os
 import platform
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -141,6 +143,23 @@ class RunFolder:
                 "Pass the folder that the run printed when it began."
             )
         return run
+
+    @contextmanager
+    def locked(self) -> Iterator[None]:
+        """Keeps other runs from writing here; a killed process holds nothing.
+
+        Raises:
+            CheckpointError: another one is writing.
+        """
+        with open(self.path / ".lock", "a") as file:
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError as error:
+                raise CheckpointError(
+                    f"another run is writing to {self.path}; wait for its end, or choose another "
+                    "folder with folder=<path>."
+                ) from error
+            yield
 
     def config(self) -> dict[str, Any]:
         """The config of the run."""

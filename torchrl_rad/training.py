@@ -11,7 +11,8 @@ from typing import Any
 
 import torch
 from tensordict import TensorDictBase
-from torch import Tensor
+from torch import Tensor, nn
+from torch.nn.parallel import DistributedDataParallel
 from torch.nn.utils import clip_grad_norm_
 from torch.optim.lr_scheduler import LambdaLR
 from torchrl.checkpoint import GlobalRNGState
@@ -20,6 +21,13 @@ from torchrl.objectives.common import LossModule
 from tqdm import tqdm
 
 from torchrl_rad.checkpoint import Checkpointer
+from torchrl_rad.parallel import (
+    drawing_for,
+    mean_over_processes,
+    share_of_batch,
+    wait_for_all,
+    wanted_by_any,
+)
 
 __all__ = ["Interrupted", "Meter", "Objective", "train"]
 
@@ -80,6 +88,15 @@ class Objective:
         )
         self.scheduler = LambdaLR(self.optimizer, self._rate)
         self.updater = None if self.ema is None else SoftUpdate(self.loss, eps=self.ema)
+        self.module: nn.Module = self.loss  # what is called: the loss, or its data-parallel wrapper
+
+    def distribute(self) -> None:
+        """Averages gradients over the processes of the group from now on."""
+        self.module = DistributedDataParallel(
+            _Outputs(self.loss),
+            forward_sync_buffers=False,  # target parameters are buffers, the same ones everywhere
+            find_unused_parameters=getattr(self.loss, "partial", False),
+        )
 
     def _rate(self, step: int) -> float:
         warm = min(1.0, (step + 1) / max(1, self.warmup))
@@ -93,7 +110,7 @@ class Objective:
         """
         batch = self.prepare(windows)
         with torch.autocast(windows["observation"].device.type, torch.bfloat16, self.bf16):
-            out = self.loss(batch)
+            out = self.module(batch)
         total = sum(out[key] for key in out.keys() if key.startswith("loss_"))
         if not total.isfinite():
             raise FloatingPointError(f"{type(self.loss).__name__} gave {total.item()}.")
@@ -113,6 +130,17 @@ class Objective:
             f"{name}.optimizer": self.optimizer,
             f"{name}.scheduler": self.scheduler,
         }
+
+
+class _Outputs(nn.Module):
+    """A loss whose outputs come as a dict."""
+
+    def __init__(self, loss: LossModule):
+        super().__init__()
+        self.loss = loss
+
+    def forward(self, batch: TensorDictBase) -> dict[str, Tensor]:
+        return dict(self.loss(batch).items())
 
 
 class Meter:
@@ -165,7 +193,9 @@ def train(
     """Trains all objectives on the same windows, saving at intervals, on Ctrl-C and on SIGTERM.
 
     A resumed training draws the same batches and noise as one that was never interrupted: on a CPU
-    the losses are equal to the bit.
+    the losses are equal to the bit. In a process group each process draws the same batch and takes
+    its share of it, gradients are averaged, and the first process logs and saves: losses are those
+    of one process but for rounding, and a checkpoint goes on with any number of processes.
 
     Args:
         objectives (mapping): by name.
@@ -187,7 +217,7 @@ def train(
         CheckpointError: the checkpoint is damaged or of another run, or cannot be saved.
         FloatingPointError: a loss is NaN or Inf; the message names it and the step.
         Interrupted: it was asked to stop; what was done is saved.
-        ValueError: an interval is below 1.
+        ValueError: an interval is below 1, or a batch has no equal parts for the processes.
     """
     for interval, value in (("save_interval", save_interval), ("log_interval", log_interval)):
         if value < 1:
@@ -198,22 +228,32 @@ def train(
         parts.update(objective.components(name))
     latest = checkpointer.latest() if resume else None
     begin = 0 if latest is None else checkpointer.load(latest, parts, meta)["step"]
-    if begun is not None:
+    share = share_of_batch()
+    writes = share.rank == 0
+    if share.world > 1:
+        for objective in objectives.values():
+            objective.distribute()
+    if begun is not None and writes:
         begun(begin)
-    bar = tqdm(total=steps, initial=begin, desc="training", unit="step", disable=not progress)
-    with bar, _stop_requests() as stop:
+    hidden = not (progress and writes)
+    bar = tqdm(total=steps, initial=begin, desc="training", unit="step", disable=hidden)
+    with bar, drawing_for(share), _stop_requests() as stop:
         for step in range(begin + 1, steps + 1):
-            meter.add(_update_all(objectives, sample(), step))
+            windows = share.of(sample())
+            meter.add(_update_all(objectives, windows, step))
             if step % log_interval == 0 or step == steps:
-                means = meter.read()
-                log(step, means)
+                means = mean_over_processes(meter.read(), windows.device or "cpu")
+                if writes:
+                    log(step, means)
                 bar.set_postfix_str(_short(means))
             bar.update()
-            stopped = stop.requested
-            if step % save_interval == 0 or step == steps or stopped:
+            stopped = wanted_by_any(stop.requested, windows.device or "cpu")
+            if (step % save_interval == 0 or step == steps or stopped) and writes:
                 checkpointer.save(step, parts, meta)
             if stopped:
+                wait_for_all()  # until it is saved
                 raise Interrupted(step)
+    wait_for_all()
     return begin
 
 

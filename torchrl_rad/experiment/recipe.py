@@ -7,6 +7,7 @@ import logging
 import sys
 import warnings
 from collections.abc import Callable, Mapping
+from contextlib import nullcontext
 from typing import Any
 
 import torch
@@ -36,6 +37,7 @@ from torchrl_rad.experiment.scoring import evaluate_policies
 from torchrl_rad.learned_value import learn_value
 from torchrl_rad.modules.step import StepEstimator
 from torchrl_rad.objectives.step import StepEstimationLoss, draw_step_pairs
+from torchrl_rad.parallel import first_before_others, first_decides, is_first, process_group
 from torchrl_rad.plots import plot_curves, plot_targets
 from torchrl_rad.policy import save_policy
 from torchrl_rad.precision import uses_bf16
@@ -172,20 +174,37 @@ def save_policies(run: RunFolder, cfg: dict[str, Any], policies: Mapping[str, Po
         )
 
 
+def _say(text: Any) -> None:
+    """Prints, in the first process of a group."""
+    if is_first():
+        print(text, flush=True)
+
+
+def _open_run(cfg: dict[str, Any]) -> tuple[str, dict[str, Any]]:
+    """The run's folder, made or found, and its config."""
+    if cfg["resume"] is not None:
+        run = RunFolder.open(cfg["resume"])
+        progress, saved = cfg["logger"]["progress"], run.config()
+        saved["logger"]["progress"] = progress
+        return str(run.path), saved
+    resolve_dataset(cfg)
+    date = datetime.datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
+    folder = cfg["folder"] or f"outputs/{cfg['env']['name']}/{date}-seed{cfg['seed']}"
+    return str(RunFolder.create(folder, cfg).path), cfg
+
+
 def _whole_run(
     run: RunFolder, cfg: dict[str, Any], make_objectives: MakeObjectives, resume: bool
 ) -> None:
     """From the data to the table."""
-    if cfg["device"].startswith("cuda") and not torch.cuda.is_available():
-        raise ValueError(f"device is {cfg['device']!r}, but torch sees no GPU; use device=cpu.")
     torch.set_num_threads(cfg["threads"])
     torch.manual_seed(cfg["seed"])  # fresh weights are the same when resumed
     if cfg["loss"]["value"] not in ("recorded", "iql"):
         raise ValueError(f"loss.value is {cfg['loss']['value']!r}; expected 'recorded' or 'iql'.")
-    print(f"run folder: {run.path}\ndata: {cfg['replay_buffer']['dataset']}", flush=True)
-    task, data = make_data(cfg)
-    print(check_data(task, data), flush=True)
-    print(describe_windows(data, cfg["network"]["horizon"]), flush=True)
+    _say(f"run folder: {run.path}\ndata: {cfg['replay_buffer']['dataset']}")
+    task, data = first_before_others(lambda: make_data(cfg))  # which may record it
+    _say(check_data(task, data))
+    _say(describe_windows(data, cfg["network"]["horizon"]))
     policies = make_policies(cfg["network"], cfg["retrieval"], data)
     for parts in policies.values():
         parts.policy.to(cfg["device"])
@@ -193,17 +212,21 @@ def _whole_run(
         if parts.database is not None:
             total, kept = (len(t["episode"].unique()) for t in (data, parts.database[:]))
             share = f"{kept} of {total} episodes ({kept / total:.1%})"
-            print(f"{name}: {share}, {len(parts.database)} rows", flush=True)
+            _say(f"{name}: {share}, {len(parts.database)} rows")
             if kept == total and parts.database.expert is not None:
                 advice = f"retrieval.{name}.expert='{{rule: top_share_by_return, args: [0.1]}}'"
-                print(f"WARNING: {name}'s rule keeps every episode; choose by {advice}", flush=True)
+                _say(f"WARNING: {name}'s rule keeps every episode; choose by {advice}")
     data = data.to(cfg["device"]) if cfg["device"] != "cpu" else data
-    if cfg.get("weights"):
-        take_weights(policies, cfg["weights"])
-    else:
+    trained = not cfg.get("weights")
+    if trained:
         if cfg["loss"]["value"] == "iql":
             data["value"] = learn_value(run, cfg, data, task.over(data))
         train_policies(run, cfg, policies, data, make_objectives, resume)
+    else:
+        take_weights(policies, cfg["weights"])
+    if not is_first():
+        return  # the first process evaluates
+    if trained:
         plot_curves(run.metrics.rows(), run.path / "curves.png")
     save_policies(run, cfg, policies)
     rows, episodes = evaluate_policies(run, cfg, task, policies, data)
@@ -226,22 +249,18 @@ def run_recipe(
     """
     torchrl_logger.setLevel(logging.WARNING)
     warnings.filterwarnings("ignore", "The name target_actor_network_params")  # of BCLoss
-    resume = cfg["resume"] is not None
+    resume, folder = cfg["resume"] is not None, None
     try:
-        if resume:
-            run = RunFolder.open(cfg["resume"])
-            progress, cfg = cfg["logger"]["progress"], run.config()
-            cfg["logger"]["progress"] = progress
-        else:
-            resolve_dataset(cfg)
-            date = datetime.datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
-            folder = cfg["folder"] or f"outputs/{cfg['env']['name']}/{date}-seed{cfg['seed']}"
-            run = RunFolder.create(folder, cfg)
-        _whole_run(run, cfg, make_objectives, resume)
+        with process_group(cfg["device"]) as device:
+            folder, cfg = first_decides(lambda: _open_run(cfg))
+            cfg["device"] = device
+            run = RunFolder(folder)
+            with run.locked() if is_first() else nullcontext():
+                _whole_run(run, cfg, make_objectives, resume)
     except KeyboardInterrupt as stop:
         at = f" and saved at step {stop.args[0]}" if isinstance(stop, Interrupted) else ""
         print(f"\nstopped{at}; go on with:", file=sys.stderr)
-        print(f"python recipes/{recipe} resume={run.path}", file=sys.stderr)
+        print(f"python recipes/{recipe} resume={folder}", file=sys.stderr)
         sys.exit(130)
     except ERRORS as error:
         sys.exit(f"error: {error.args[0] if isinstance(error, KeyError) else error}")

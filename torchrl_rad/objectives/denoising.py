@@ -22,6 +22,7 @@ from torchrl_rad.objectives.common import (
     read_windows,
     window_masks,
 )
+from torchrl_rad.parallel import draw_rows
 
 __all__ = ["DenoisingLoss"]
 
@@ -113,6 +114,7 @@ class DenoisingLoss(KeyedLoss):
                 f"only is {self.numbers}; these plans have levels 0 to {len(self.levels) - 1}."
             )
         self._out_keys = ["loss_denoising", *(f"level_{n}" for n in self.numbers)]
+        self.partial = len(self.numbers) < len(self.levels)  # some weights get no gradient
         self.no_target = no_target if planner.targets else 1.0
         self.pseudo_step, self.next_weight = pseudo_step, next_weight
         self.reduction = "mean" if reduction is None else reduction
@@ -150,8 +152,9 @@ class DenoisingLoss(KeyedLoss):
         clean, mask = self.pieces(number, windows)
         change = change_of(self.planner_changes, number)
         clean = encode_states(clean, self.planner_normalizer, change)
-        time = torch.rand(len(clean), device=clean.device)
-        noise = torch.randn_like(clean)
+        device, shape = clean.device, clean.shape[1:]
+        time = draw_rows(lambda rows: torch.rand(rows, device=device), len(clean))
+        noise = draw_rows(lambda rows: torch.randn(rows, *shape, device=device), len(clean))
         noisy = torch.where(mask, clean, self.process.corrupt(clean, noise, time[:, None, None]))
         free = self.levels[number].free(number)  # the others count for nothing
         predicted = self.network(number, noisy, mask, time, free=free).to(clean.dtype)
@@ -172,17 +175,19 @@ class DenoisingLoss(KeyedLoss):
         """
         level, count, device = self.levels[number], len(windows), windows.device
         rows = torch.arange(count, device=device)
-        begin = torch.randint(self.horizon - level.span, (count,), device=device)
+        places, span = self.horizon - level.span, level.span
+        begin = draw_rows(lambda n: torch.randint(places, (n,), device=device), count)
         grid = begin[:, None] + torch.arange(level.tokens, device=device) * level.jump  # [B, n]
         clean = windows[rows[:, None], grid]
         mask = torch.zeros(count, level.tokens, dtype=torch.bool, device=device)
         mask[:, 0] = True
         mask[:, -1] = number > 0
-        step = torch.randint(1, level.span + 1, (count,), device=device)
+        step = draw_rows(lambda n: torch.randint(1, span + 1, (n,), device=device), count)
         if self.pseudo_step is not None:  # on levels that do not reach so far, at their end
             step = torch.full_like(step, min(self.pseudo_step, level.span))
         place = self.placement(step, number, *level)
-        pinned = place.active & (torch.rand(count, device=device) >= self.no_target)
+        chance = draw_rows(lambda n: torch.rand(n, device=device), count)
+        pinned = place.active & (chance >= self.no_target)
         # a shifted placement pins the window's own state; others move that at `step` to the grid
         moved = windows[rows, begin + place.time]
         here = torch.arange(level.tokens, device=device) == place.token[:, None]

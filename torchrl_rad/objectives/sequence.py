@@ -24,6 +24,7 @@ from torchrl_rad.objectives.common import (
     window_masks,
 )
 from torchrl_rad.objectives.guidance import guidance_outputs, return_target
+from torchrl_rad.parallel import draw_rows
 
 __all__ = ["SequenceDenoisingLoss", "SequenceGuidanceLoss", "draw_pins"]
 
@@ -47,10 +48,10 @@ def draw_pins(
         >>> draw_pins(1, 4, no_target=1.0, device=torch.device("cpu")).squeeze().tolist()
         [True, False, False, False]
     """
-    step = torch.randint(1, horizon, (count,), device=device)
+    step = draw_rows(lambda n: torch.randint(1, horizon, (n,), device=device), count)
     if pseudo_step is not None:
         step = torch.full_like(step, pseudo_step)
-    pinned = torch.rand(count, device=device) >= no_target
+    pinned = draw_rows(lambda n: torch.rand(n, device=device), count) >= no_target
     places = torch.arange(horizon, device=device)  # [H]
     mask = (places == step[:, None]) & pinned[:, None]
     return (mask | (places == 0))[..., None]
@@ -72,8 +73,9 @@ def _corrupt(
     mask = draw_pins(count, horizon, no_target, clean.device, pseudo_step)
     of_states = torch.arange(width, device=clean.device) < state_dim
     entries = mask & of_states
-    time = torch.rand(count, device=clean.device)
-    noisy = process.corrupt(clean, torch.randn_like(clean), time[:, None, None])
+    time = draw_rows(lambda n: torch.rand(n, device=clean.device), count)
+    noise = draw_rows(lambda n: torch.randn(n, horizon, width, device=clean.device), count)
+    noisy = process.corrupt(clean, noise, time[:, None, None])
     return _Noisy(torch.where(entries, clean, noisy), mask, entries, time)
 
 

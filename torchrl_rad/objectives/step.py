@@ -14,6 +14,7 @@ from torch import Tensor
 
 from torchrl_rad.modules.step import StepEstimator
 from torchrl_rad.objectives.common import KeyedLoss, window_masks
+from torchrl_rad.parallel import draw_rows
 
 __all__ = ["StepEstimationLoss", "draw_step_pairs"]
 
@@ -61,9 +62,15 @@ def draw_step_pairs(
             f"windows of {horizon} states or more."
         )
     rows = torch.arange(len(windows), device=device).repeat_interleave(pairs)
-    step = torch.randint(1, horizon, rows.shape, generator=generator, device=device)
-    room = (length - step).float()
-    begin = (torch.rand(rows.shape, generator=generator, device=device) * room).long()
+
+    def steps(count: int) -> Tensor:
+        return torch.randint(1, horizon, (count,), generator=generator, device=device)
+
+    def places(count: int) -> Tensor:
+        return torch.rand(count, generator=generator, device=device)
+
+    step = draw_rows(steps, len(rows))
+    begin = (draw_rows(places, len(rows)) * (length - step).float()).long()
     state, target = windows[rows, begin], windows[rows, begin + step]
     drawn = {"observation": state, "target": target, "target_step": step[:, None]}
     return TensorDict(drawn, rows.shape)
