@@ -11,6 +11,8 @@ from collections.abc import Mapping
 from typing import Any
 
 import hydra
+from hydra.core.hydra_config import HydraConfig
+from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
 from torchrl_rad import Objective, SequenceDenoisingLoss, SequenceGuidanceLoss
@@ -54,7 +56,7 @@ def main(config: DictConfig) -> None:
     """Reads the command line."""
     cfg = OmegaConf.to_container(config, resolve=True)
     cfg["network"] = cfg.pop("diffuser")
-    run_recipe(cfg, make_objectives, "d_rad.py")
+    run_recipe(cfg, make_objectives, "d_rad.py", sweep=HydraConfig.get().mode == RunMode.MULTIRUN)
 
 
 if __name__ == "__main__":

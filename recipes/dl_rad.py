@@ -11,6 +11,8 @@ from collections.abc import Mapping
 from typing import Any
 
 import hydra
+from hydra.core.hydra_config import HydraConfig
+from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from torchrl.objectives import BCLoss
 
@@ -75,7 +77,7 @@ def main(config: DictConfig) -> None:
     """Reads the command line."""
     cfg = OmegaConf.to_container(config, resolve=True)
     cfg.pop("diffuser", None)  # of the other recipe
-    run_recipe(cfg, make_objectives)
+    run_recipe(cfg, make_objectives, sweep=HydraConfig.get().mode == RunMode.MULTIRUN)
 
 
 if __name__ == "__main__":

@@ -11,8 +11,9 @@ import numpy as np
 from torchrl_rad._files import CheckpointError, read_json, write_json
 from torchrl_rad.evaluation import interval
 
-__all__ = ["format_table", "merge_results", "write_results"]
+__all__ = ["format_table", "merge_results", "merge_sweep", "write_results"]
 
+ERROR = "error.txt"  # in a run folder: what it died of
 MEANS = (
     "return", "length", "success", "arrival", "share", "found", "similarity", "step_error",
 )  # fmt: skip
@@ -88,6 +89,37 @@ def merge_results(folders: Sequence[str | Path]) -> dict[str, dict[str, Any]]:
         raise CheckpointError(f"these runs are of several tasks, {sorted(tasks)}; merge each.")
     names = [name for name in runs[0]["rows"] if all(name in run["rows"] for run in runs)]
     return {name: _merge([run["rows"][name] for run in runs]) for name in names}
+
+
+def merge_sweep(folders: Sequence[str | Path]) -> tuple[dict[str, dict[str, Any]], dict[str, str]]:
+    """Rows of the runs of a sweep, task by task, and which runs have no results.
+
+    Args:
+        folders (sequence of path): run folders, of any tasks.
+
+    Returns:
+        Figures for :func:`format_table` by ``"<task> <policy>"``, or by the policy alone where all
+        runs are of one task; and folder -> what its run died of.
+
+    Raises:
+        CheckpointError: no folders, or a ``results.json`` that is not of a run.
+    """
+    if len(folders) == 0:
+        raise CheckpointError("no run folders to merge; pass one or more.")
+    tasks: dict[str, list[Path]] = {}
+    failed = {}
+    for folder in map(Path, folders):
+        if (folder / "results.json").exists():
+            tasks.setdefault(_read(folder)["task"], []).append(folder)
+        else:
+            file = folder / ERROR
+            why = file.read_text().strip() if file.exists() else "it is not over, or was killed"
+            failed[str(folder)] = why
+    rows = {}
+    for task, of_task in tasks.items():
+        for name, row in merge_results(of_task).items():
+            rows[name if len(tasks) == 1 else f"{task} {name}"] = row
+    return rows, failed
 
 
 def write_results(folder: str | Path, results: Mapping[str, Any]) -> None:

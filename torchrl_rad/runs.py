@@ -19,6 +19,7 @@ from tensordict import TensorDict, TensorDictBase
 
 from torchrl_rad._files import CheckpointError, read_json, write_atomic, write_json
 from torchrl_rad._states import load_tensors, save_tensors
+from torchrl_rad.results import ERROR
 
 __all__ = ["MetricsLog", "RunFolder", "environment_facts"]
 
@@ -89,6 +90,7 @@ class RunFolder:
     ``results.json``            each figure of the table and each episode's return
     ``curves.png``              losses
     ``targets.png``             paths, retrieved targets and plans
+    ``error.txt``               what the run died of, if it did
     ==========================  ===========================================================
 
     Args:
@@ -164,6 +166,14 @@ class RunFolder:
     def config(self) -> dict[str, Any]:
         """The config of the run."""
         return read_json(self.path / "config.json")
+
+    def note_error(self, text: str | None) -> None:
+        """Notes what the run died of, or that it lives, in ``error.txt``."""
+        file = self.path / ERROR
+        if text is None:
+            file.unlink(missing_ok=True)
+        else:
+            write_atomic(file, f"{text}\n")
 
     def results(self) -> dict[str, Any]:
         """The content of ``results.json``; empty before there are any."""

@@ -15,6 +15,7 @@ from importlib.metadata import version
 import pytest
 import torch
 
+from torchrl_rad.experiment.recipe import _new_folder
 from torchrl_rad.policy import load_policy
 from torchrl_rad.results import format_table
 from torchrl_rad.runs import MetricsLog, RunFolder
@@ -32,6 +33,7 @@ def test_files(whole):
     run, _ = whole
     names = {path.name for path in run.path.iterdir()}
     assert names == {
+        ".lock",
         "checkpoints",
         "config.json",
         "curves.png",
@@ -346,6 +348,32 @@ def test_seeds_and_their_table(tmp_path):
         scores = [RunFolder.open(f).results()["rows"][name]["score"] for f in folders]
         assert f"| {sum(scores) / 2:.1f} |" in line
         assert f"| 4 | {scores[0]:.1f}, {scores[1]:.1f} |" in line
+
+
+def test_a_failed_run_does_not_end_a_sweep(tmp_path):
+    """Of runs that joblib launches the second has nothing to do."""
+    pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
+    code, _, err = call(
+        "dl_rad.py", "--multirun", "hydra/launcher=joblib", "hydra.launcher.n_jobs=1", *SMALL,
+        "~retrieval.followed", "optim.gradient_steps=2,0,1",
+    )  # fmt: skip
+    assert code == 1
+    assert "steps is 0; expected 1 or more" in err
+    folders = sorted((tmp_path / "outputs" / "pointmaze-umaze").iterdir())
+    steps = [RunFolder.open(folder).config()["optim"]["gradient_steps"] for folder in folders]
+    assert steps == [2, 0, 1]
+    assert [(folder / "results.json").exists() for folder in folders] == [True, False, True]
+    code, table, err = call("merge.py", *map(str, folders))
+    assert code == 1
+    assert len(table.splitlines()) == 4  # backbone and paper
+    assert err.splitlines()[1] == f"  {folders[1]}: error: steps is 0; expected 1 or more."
+    # gone on with, it is alive
+    assert_error(call("dl_rad.py", f"resume={folders[1]}"), "steps is 0")
+
+
+def test_runs_that_begin_in_one_second_get_folders_of_their_own(tmp_path, monkeypatch):
+    names = [_new_folder("outputs/task/now-seed0").name for _ in range(3)]
+    assert names == ["now-seed0", "now-seed0-2", "now-seed0-3"]
 
 
 if __name__ == "__main__":

@@ -59,19 +59,37 @@ def test_one_run(folder):
     assert out.splitlines()[2].endswith("| 2 | 10.0 |")
 
 
-def test_run_that_is_not_over(folder, tmp_path):
-    (tmp_path / "b").mkdir()
-    code, out, _ = call(folder("a", 10.0), tmp_path / "b")
-    assert out == ""
+def test_runs_without_results_are_named_beside_the_table(folder, tmp_path):
+    for name in ("b", "c"):
+        (tmp_path / name).mkdir()
+    (tmp_path / "c" / "error.txt").write_text("error: the disk is full\n")
+    code, out, _ = call(folder("a", 10.0), tmp_path / "b", tmp_path / "c")
+    assert out.splitlines()[2].endswith("| 2 | 10.0 |")
     assert code == (
-        f"error: {tmp_path / 'b'} has no results.json; its run failed or is not over "
-        f"(resume={tmp_path / 'b'})."
+        "2 runs have no results (go on with resume=<folder>):\n"
+        f"  {tmp_path / 'b'}: it is not over, or was killed\n"
+        f"  {tmp_path / 'c'}: error: the disk is full"
     )
 
 
-def test_other_task(folder):
-    code, _, _ = call(folder("a", 10.0), folder("b", 10.0, "pointmaze-large"))
-    assert code.startswith("error: these runs are of several tasks, ['pointmaze-large', 'point")
+def test_no_run_has_results(tmp_path):
+    code, out, _ = call(tmp_path / "a")
+    assert out == ""
+    assert code.startswith("1 run has no results")
+
+
+def test_several_tasks(folder):
+    code, out, _ = call(folder("a", 10.0), folder("b", 20.0, "pointmaze-large"), folder("c", 30.0))
+    assert code == 0
+    rows = [line.split(" | ") for line in out.splitlines()[2:]]
+    assert [row[0].removeprefix("| ") for row in rows] == [
+        "pointmaze-umaze backbone",
+        "pointmaze-umaze followed",
+        "pointmaze-large backbone",
+        "pointmaze-large followed",
+    ]
+    assert [row[2] for row in rows] == ["20.0", "20.0", "20.0", "20.0"]
+    assert [row[-1] for row in rows] == ["10.0, 30.0 |"] * 2 + ["20.0 |"] * 2
 
 
 def test_no_folder():

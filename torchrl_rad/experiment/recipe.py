@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import datetime
+import itertools
 import logging
 import sys
 import warnings
 from collections.abc import Callable, Mapping
 from contextlib import nullcontext
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -188,9 +190,24 @@ def _open_run(cfg: dict[str, Any]) -> tuple[str, dict[str, Any]]:
         saved["logger"]["progress"] = progress
         return str(run.path), saved
     resolve_dataset(cfg)
+    if cfg["folder"] is not None:
+        return str(RunFolder.create(cfg["folder"], cfg).path), cfg
     date = datetime.datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
-    folder = cfg["folder"] or f"outputs/{cfg['env']['name']}/{date}-seed{cfg['seed']}"
-    return str(RunFolder.create(folder, cfg).path), cfg
+    folder = f"outputs/{cfg['env']['name']}/{date}-seed{cfg['seed']}"
+    return str(RunFolder.create(_new_folder(folder), cfg).path), cfg
+
+
+def _new_folder(name: str) -> Path:
+    """Makes a folder of that name, or where one is (of a sweep), of that name and a number."""
+    for number in itertools.count(1):
+        path = Path(name if number == 1 else f"{name}-{number}")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            path.mkdir()
+        except FileExistsError:
+            continue
+        return path
+    raise AssertionError("numbers do not end")
 
 
 def _whole_run(
@@ -238,29 +255,43 @@ def _whole_run(
 
 
 def run_recipe(
-    cfg: dict[str, Any], make_objectives: MakeObjectives, recipe: str = "dl_rad.py"
+    cfg: dict[str, Any],
+    make_objectives: MakeObjectives,
+    recipe: str = "dl_rad.py",
+    sweep: bool = False,
 ) -> None:
-    """Runs a recipe; errors that a user can mend end in one line.
+    """Runs a recipe; errors that a user can mend end in one line, kept in ``error.txt``.
 
     Args:
         cfg (dict): the resolved config; with ``resume`` that of the run folder it names is taken.
         make_objectives (callable): the losses of the recipe.
         recipe (str, optional): its file, named where it says how to go on.
+        sweep (bool, optional): it is one of several runs; its errors do not end the others.
+
+    Raises:
+        RuntimeError: an error, in a sweep.
     """
     torchrl_logger.setLevel(logging.WARNING)
     warnings.filterwarnings("ignore", "The name target_actor_network_params")  # of BCLoss
-    resume, folder = cfg["resume"] is not None, None
+    resume, run = cfg["resume"] is not None, None
     try:
         with process_group(cfg["device"]) as device:
             folder, cfg = first_decides(lambda: _open_run(cfg))
             cfg["device"] = device
-            run = RunFolder(folder)
-            with run.locked() if is_first() else nullcontext():
+            opened = RunFolder(folder)
+            with opened.locked() if is_first() else nullcontext():
+                run = opened  # from here on its folder is ours
+                run.note_error(None)
                 _whole_run(run, cfg, make_objectives, resume)
     except KeyboardInterrupt as stop:
         at = f" and saved at step {stop.args[0]}" if isinstance(stop, Interrupted) else ""
         print(f"\nstopped{at}; go on with:", file=sys.stderr)
-        print(f"python recipes/{recipe} resume={folder}", file=sys.stderr)
+        print(f"python recipes/{recipe} resume={run.path if run else '<folder>'}", file=sys.stderr)
         sys.exit(130)
     except ERRORS as error:
-        sys.exit(f"error: {error.args[0] if isinstance(error, KeyError) else error}")
+        text = f"error: {error.args[0] if isinstance(error, KeyError) else error}"
+        if run is not None:
+            run.note_error(text)
+        if sweep:
+            raise RuntimeError(text) from error
+        sys.exit(text)
