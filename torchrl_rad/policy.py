@@ -158,11 +158,16 @@ def with_goals(
         goal_reward (GoalReward, optional): when it is reached. Defaults to within 0.5 of it.
 
     Raises:
-        ValueError: the policy has no targets.
+        ValueError: the policy has no targets, or its planner is told returns.
     """
     if len(policy) != 3:
         raise ValueError("this policy has no targets; goals need one of TS, SE and PL.")
     select, estimator, planner = policy
+    if planner.condition is not None:
+        raise ValueError(
+            "this planner is told returns, which are of the goal it was trained for; train it "
+            "with network.condition=null."
+        )
     names = ("horizon", "rule", "ahead", "retrieval_interval", "min_offset")
     settings = {name: getattr(select, name) for name in names}
     select = RetrievalTargetModule(
@@ -202,6 +207,8 @@ def fit_scales(policy: TensorDictSequential, data: TensorDictBase) -> None:
         if planner.changes is not None:
             for level, scale in zip(planner.levels, planner.changes, strict=True):
                 scale.load_state_dict(level_changes(now, data["episode"], level).state_dict())
+        if planner.condition is not None:
+            planner.condition.fit(data["return_to_go"])
     if planner.return_model is not None:
         planner.return_model.fit_scale(data["return_to_go"])
 

@@ -162,7 +162,7 @@ def test_training_places_as_planning_does(name, horizon, jumps):
     rows = 400
     windows = database[:]["observation"].expand(rows, horizon, 2)
     for number, level in enumerate(planner.levels):
-        clean, mask = loss.pieces(number, windows)
+        clean, mask, _ = loss.pieces(number, windows)
         begin, step = clean[:, 0, 0].long(), loss.placement.step
         assert set(step.tolist()) <= set(range(1, level.span + 1))
         assert int((begin + level.span).max()) < horizon

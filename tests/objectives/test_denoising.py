@@ -158,7 +158,7 @@ def test_share_without_a_target(share):
     loss = make(no_target=share)
     torch.manual_seed(0)
     for number, known in ((0, 1), (1, 2)):  # the first state; on finer levels the last one too
-        _, mask = loss.pieces(number, torch.randn(3000, HORIZON, DIM))
+        _, mask, _ = loss.pieces(number, torch.randn(3000, HORIZON, DIM))
         pinned = mask.squeeze(-1).sum(-1) > known
         if number == 0:
             assert float(pinned.float().mean()) == pytest.approx(1 - share, abs=0.03)
@@ -168,9 +168,9 @@ def test_share_without_a_target(share):
 
 def test_pseudo_targets_at_one_step():
     loss = make(no_target=0.0, pseudo_step=6)
-    _, mask = loss.pieces(0, torch.randn(300, HORIZON, DIM))
+    _, mask, _ = loss.pieces(0, torch.randn(300, HORIZON, DIM))
     assert mask.squeeze(-1).tolist() == [[True, False, True, False, False]] * 300
-    _, mask = loss.pieces(1, torch.randn(300, HORIZON, DIM))  # three steps long: at its end
+    _, mask, _ = loss.pieces(1, torch.randn(300, HORIZON, DIM))  # three steps long: at its end
     assert mask.squeeze(-1).tolist() == [[True, False, False, True]] * 300
 
 
@@ -182,7 +182,7 @@ def test_bad_pseudo_step(step):
 
 def test_planner_without_targets_is_trained_without():
     loss = make(targets=False, no_target=0.0)
-    _, mask = loss.pieces(0, torch.randn(300, HORIZON, DIM))
+    _, mask, _ = loss.pieces(0, torch.randn(300, HORIZON, DIM))
     assert mask.squeeze(-1).tolist() == [[True, False, False, False, False]] * 300
 
 
@@ -192,7 +192,7 @@ def test_pieces_are_evenly_spaced_parts_of_a_window(level, jump, tokens):
     rows = 100.0 * torch.arange(500)[:, None, None]
     steps = torch.arange(float(HORIZON))[None, :, None].expand(500, HORIZON, DIM)
     torch.manual_seed(0)
-    clean, _ = loss.pieces(level, rows + steps)
+    clean, _, _ = loss.pieces(level, rows + steps)
     begin = (clean - rows)[:, :1]
     assert torch.equal(
         clean - rows - begin, (jump * torch.arange(tokens))[None, :, None] + 0 * clean
@@ -323,7 +323,7 @@ def test_separate_levels():
     loss = make()
     with torch.random.fork_rng():
         with loss.network_params.to_module(loss.network):
-            loss._level(1, torch.randn(8, HORIZON, DIM)).sum().backward()
+            loss._level(1, torch.randn(8, HORIZON, DIM), None).sum().backward()
     for name, parameter in loss.named_parameters():
         used = ".1." in name
         assert (parameter.grad is not None and bool(parameter.grad.any())) == used, name

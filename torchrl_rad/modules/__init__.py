@@ -1,5 +1,6 @@
 """TS, SE and PL as TensorDict modules."""
 
+from torchrl_rad.modules.condition import ReturnCondition
 from torchrl_rad.modules.diffuser import DiffuserPlanner
 from torchrl_rad.modules.diffuser_lite import DiffuserLitePlanner
 from torchrl_rad.modules.dit import DiT
@@ -36,6 +37,7 @@ __all__ = [
     "PlainTargetModule",
     "RectifiedFlow",
     "RetrievalTargetModule",
+    "ReturnCondition",
     "ReturnModel",
     "StepEstimator",
     "TargetPlacement",

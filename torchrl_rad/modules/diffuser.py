@@ -216,7 +216,11 @@ class DiffuserPlanner(Planner):
     # networks at the times of the sampler
 
     def _step_network(
-        self, network: nn.Module, times: Sequence[float], dtype: torch.dtype | None
+        self,
+        network: nn.Module,
+        times: Sequence[float],
+        dtype: torch.dtype | None,
+        condition: Tensor | None,
     ) -> StepNetwork:
         if self._freezes(network, TemporalUNet) and dtype in (None, torch.float16):
             return FrozenUNet(cast(TemporalUNet, network), times)  # a CPU convolves in float32

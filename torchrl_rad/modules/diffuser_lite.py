@@ -11,6 +11,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor, nn
 
 from torchrl_rad.data.database import ExpertDatabase
+from torchrl_rad.modules.condition import ReturnCondition
 from torchrl_rad.modules.dit import DiT
 from torchrl_rad.modules.frozen import StepNetwork
 from torchrl_rad.modules.inverse import InverseDynamics
@@ -81,6 +82,9 @@ class DiffuserLitePlanner(Planner):
             it, in units of the changes that the level's grid meets in the data (``changes``, see
             :func:`fit_scales`), rather than as standardised states. One step changes a robot's
             state by a small part of its deviation. Defaults to ``False``.
+        condition (float, optional): the networks are told the return that a plan is to have, here
+            one that this share of the recorded ones lies below (see :class:`ReturnCondition`).
+            Defaults to none: they are told nothing.
         in_keys, out_keys (sequence of NestedKey, optional): new names, in the order of the table.
 
     Raises:
@@ -119,6 +123,7 @@ class DiffuserLitePlanner(Planner):
         placement: str = "shifted",
         database: ExpertDatabase | None = None,
         relative: bool = False,
+        condition: float | None = None,
         in_keys: Sequence[NestedKey] | None = None,
         out_keys: Sequence[NestedKey] = ("plan", "action"),
     ):
@@ -152,8 +157,11 @@ class DiffuserLitePlanner(Planner):
         self.__dict__["database"] = database  # a handle, as in RetrievalTargetModule
         self.inverse_dynamics = inverse_dynamics
         state_dim = len(normalizer.mean)
+        self.condition = None if condition is None else ReturnCondition(condition)
+        conditioned = condition is not None
         self.networks = PlanNetworks(
-            DiT(state_dim, level.tokens, width, heads, blocks) for level in self.levels
+            DiT(state_dim, level.tokens, width, heads, blocks, conditioned=conditioned)
+            for level in self.levels
         )
         self.changes: nn.ModuleList | None = None
         if relative:

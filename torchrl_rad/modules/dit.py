@@ -74,6 +74,8 @@ class DiT(nn.Module):
         heads (int, optional): Defaults to ``8``.
         blocks (int, optional): Defaults to ``2``.
         mask_channel (bool, optional): Defaults to ``True``.
+        conditioned (bool, optional): the network is also told a number for each plan, such as the
+            return that it is to have. Defaults to ``False``.
 
     Examples:
         >>> network = DiT(state_dim=4, tokens=5)
@@ -92,6 +94,7 @@ class DiT(nn.Module):
         heads: int = 8,
         blocks: int = 2,
         mask_channel: bool = True,
+        conditioned: bool = False,
     ):
         super().__init__()
         if width % heads or width % 2 or width < 4:
@@ -106,6 +109,11 @@ class DiT(nn.Module):
         self.time = nn.Sequential(
             nn.Linear(width, width), nn.SiLU(), nn.Linear(width, width), nn.SiLU()
         )
+        self.condition: nn.Module | None = None
+        if conditioned:
+            self.condition = nn.Sequential(
+                nn.Linear(1, width), nn.SiLU(), nn.Linear(width, width), nn.SiLU()
+            )
         self.blocks = nn.ModuleList(Block(width, heads) for _ in range(blocks))
         self.norm = nn.LayerNorm(width, eps=1e-6, elementwise_affine=False)
         self.modulation = nn.Linear(width, 2 * width)
@@ -122,7 +130,23 @@ class DiT(nn.Module):
             if name.endswith(("modulation.weight", "head.weight")):
                 nn.init.zeros_(parameter)
 
-    def forward(self, x: Tensor, mask: Tensor, time: Tensor, free: slice | None = None) -> Tensor:
+    def modulator(self, time: Tensor, condition: Tensor | None = None) -> Tensor:
+        """What scales and shifts all blocks: [B or 1, W] of times and conditions [B], or [1]."""
+        codes = sinusoids(1000.0 * time, self.width)
+        told = self.time(codes.to(self.positions.dtype))
+        if self.condition is None:
+            return told
+        assert condition is not None  # the planner has one if its networks want it
+        return told + self.condition(condition[:, None].to(self.positions.dtype))
+
+    def forward(
+        self,
+        x: Tensor,
+        mask: Tensor,
+        time: Tensor,
+        free: slice | None = None,
+        condition: Tensor | None = None,
+    ) -> Tensor:
         """Predicts [B, f, S].
 
         Args:
@@ -130,15 +154,15 @@ class DiT(nn.Module):
             mask (Tensor): bool [B, n, 1], True where they are known.
             time (Tensor): of the process, [B], or [1] for all alike.
             free (slice, optional): the f tokens asked for. Defaults to all.
+            condition (Tensor, optional): [B], or [1] for all alike; where it is ``conditioned``.
         """
         if self.mask_channel:
             x = torch.cat([x, mask.to(x.dtype)], -1)
         x = self.embed(x)
         x = x + self.positions.to(x.dtype)  # [B, n, W], of the precision of autocast
-        codes = sinusoids(1000.0 * time, self.width)
-        condition = self.time(codes.to(self.positions.dtype))  # [B or 1, W]
+        told = self.modulator(time, condition)
         for block in self.blocks[:-1]:
-            x = block(x, condition)
-        x = self.blocks[-1](x, condition, free)
-        shift, scale = self.modulation(condition)[:, None].chunk(2, -1)
+            x = block(x, told)
+        x = self.blocks[-1](x, told, free)
+        shift, scale = self.modulation(told)[:, None].chunk(2, -1)
         return self.head(torch.addcmul(shift, self.norm(x), 1 + scale))

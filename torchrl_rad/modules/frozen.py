@@ -9,7 +9,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from torchrl_rad.modules.dit import Block, DiT, sinusoids
+from torchrl_rad.modules.dit import Block, DiT
 
 __all__ = [
     "FrozenCache",
@@ -41,12 +41,15 @@ class StepNetwork(Protocol):
 
 
 def step_network(
-    network: nn.Module, times: Sequence[float], dtype: torch.dtype | None = None
+    network: nn.Module,
+    times: Sequence[float],
+    dtype: torch.dtype | None = None,
+    condition: Tensor | None = None,
 ) -> StepNetwork:
     """A :class:`FrozenDiT`; a :class:`PlainNetwork` where something else has to be called."""
     if type(network) is DiT and not is_hooked(network):
-        return FrozenDiT(network, times, dtype)
-    return PlainNetwork(network, times, dtype)
+        return FrozenDiT(network, times, dtype, condition)
+    return PlainNetwork(network, times, dtype, condition)
 
 
 def is_hooked(network: nn.Module) -> bool:
@@ -61,6 +64,7 @@ class PlainNetwork:
         network (nn.Module): any.
         times (sequence of float): of the process, one a step.
         dtype (torch.dtype, optional): of autocast. Defaults to none.
+        condition (Tensor, optional): [1], passed on by name if there is one.
 
     Examples:
         >>> plain, mask = PlainNetwork(DiT(4, tokens=5), [1.0]), torch.zeros(3, 5, 1).bool()
@@ -69,9 +73,14 @@ class PlainNetwork:
     """
 
     def __init__(
-        self, network: nn.Module, times: Sequence[float], dtype: torch.dtype | None = None
+        self,
+        network: nn.Module,
+        times: Sequence[float],
+        dtype: torch.dtype | None = None,
+        condition: Tensor | None = None,
     ):
         self.network, self.times, self.dtype = network, times, dtype
+        self.told = {} if condition is None else {"condition": condition}
         on_cpu = all(parameter.device.type == "cpu" for parameter in network.parameters())
         if dtype == torch.float16 and on_cpu:  # quick there with packed weights only
             self.dtype = None
@@ -82,7 +91,7 @@ class PlainNetwork:
     def __call__(self, x: Tensor, prepared: Tensor, step: int, free: slice) -> Tensor:
         with torch.autocast(x.device.type, self.dtype, self.dtype is not None):
             time = torch.full((1,), self.times[step], device=x.device)
-            return self.network(x, prepared, time)[:, free].to(x.dtype)
+            return self.network(x, prepared, time, **self.told)[:, free].to(x.dtype)
 
 
 class FrozenLinear:
@@ -202,6 +211,7 @@ class FrozenDiT:
         network (DiT): copied; later changes of its weights do not show.
         times (sequence of float): of the process, one a step.
         dtype (torch.dtype, optional): of the large products. Defaults to that of the weights.
+        condition (Tensor, optional): [1], of all plans.
 
     Examples:
         >>> network = DiT(state_dim=4, tokens=5)
@@ -212,13 +222,18 @@ class FrozenDiT:
     """
 
     @torch.no_grad()
-    def __init__(self, network: DiT, times: Sequence[float], dtype: torch.dtype | None = None):
+    def __init__(
+        self,
+        network: DiT,
+        times: Sequence[float],
+        dtype: torch.dtype | None = None,
+        condition: Tensor | None = None,
+    ):
         with torch.autocast(network.positions.device.type, enabled=False):
             time = torch.tensor(times, device=network.positions.device)
-            codes = sinusoids(1000.0 * time, network.width).to(network.positions.dtype)
-            condition = network.time(codes)  # [K, W]
-            self.blocks = [FrozenBlock(b, condition, dtype) for b in network.blocks]  # type: ignore
-            shift, scale = network.modulation(condition).chunk(2, -1)
+            told = network.modulator(time, condition)  # [K, W]
+            self.blocks = [FrozenBlock(b, told, dtype) for b in network.blocks]  # type: ignore
+            shift, scale = network.modulation(told).chunk(2, -1)
             self.before = list(zip((1 + scale).unbind(0), shift.unbind(0), strict=True))
         embed, entries = network.embed, network.embed.in_features - network.mask_channel
         self.positions = network.positions + embed.bias  # [n, W]

@@ -12,6 +12,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torchrl.envs.utils import ExplorationType, exploration_type
 
+from torchrl_rad.modules.condition import ReturnCondition
 from torchrl_rad.modules.frozen import FrozenCache, StepNetwork, is_hooked, step_network
 from torchrl_rad.modules.normalizer import Normalizer
 from torchrl_rad.modules.process import Process
@@ -90,6 +91,7 @@ class Planner(TensorDictModuleBase):
     """
 
     networks: PlanNetworks
+    condition: ReturnCondition | None
 
     def __init__(
         self,
@@ -117,6 +119,7 @@ class Planner(TensorDictModuleBase):
         self.process, self.steps, self.temperatures = process, steps, list(temperatures)
         self.candidates, self.noise, self.targets = candidates, noise, targets
         self.normalizer, self.return_model = normalizer, return_model
+        self.condition = None  # a planner whose networks are told returns sets it
         self._frozen = FrozenCache()
 
     def decide(self, state: Tensor, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
@@ -160,18 +163,25 @@ class Planner(TensorDictModuleBase):
         dtype = torch.get_autocast_dtype(device.type) if lower else None
         times = self.process.grid(self.steps)[:-1]
 
+        wanted = None if self.condition is None else self.condition()
+
         def make() -> list[StepNetwork]:
-            return [self._step_network(network, times, dtype) for network in self.networks]
+            return [self._step_network(net, times, dtype, wanted) for net in self.networks]
 
         if device.type != "cpu":
             return make()  # nothing is packed there, and to compare weights would wait for it
         hooked = tuple(map(is_hooked, self.networks))
-        return self._frozen.get(self.networks, (dtype, hooked, *times), make)
+        told = None if wanted is None else wanted.item()
+        return self._frozen.get(self.networks, (dtype, hooked, told, *times), make)
 
     def _step_network(
-        self, network: nn.Module, times: Sequence[float], dtype: torch.dtype | None
+        self,
+        network: nn.Module,
+        times: Sequence[float],
+        dtype: torch.dtype | None,
+        condition: Tensor | None,
     ) -> StepNetwork:
-        return step_network(network, times, dtype)
+        return step_network(network, times, dtype, condition)
 
     # noise and candidates
 

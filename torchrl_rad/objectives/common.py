@@ -27,6 +27,8 @@ class KeyedLoss(LossModule):
         ['observation', ('next', 'target'), 'target_step']
     """
 
+    _unread: tuple[str, ...] = ()  # accepted keys that this loss does not read
+
     def __init__(self) -> None:
         super().__init__()
         self._in_keys: list[NestedKey] | None = None
@@ -35,7 +37,8 @@ class KeyedLoss(LossModule):
     def in_keys(self) -> list[NestedKey]:
         if self._in_keys is None:
             keys: Any = self.tensor_keys
-            self._in_keys = [getattr(keys, field.name) for field in fields(keys)]
+            names = [field.name for field in fields(keys) if field.name not in self._unread]
+            self._in_keys = [getattr(keys, name) for name in names]
         return self._in_keys
 
     @in_keys.setter

@@ -60,7 +60,8 @@ class DenoisingLoss(KeyedLoss):
             ``"mean"``.
 
     .. note:: The tensordict passed to :meth:`forward` must contain
-        ``self.tensor_keys.observation``, windows [*B, H, S] of raw states. Masks (``("collector",
+        ``self.tensor_keys.observation``, windows [*B, H, S] of raw states, and for a planner that
+        is told returns ``value`` [*B, H] or [*B, H, 1]. Masks (``("collector",
         "mask")``, ...) may be [*B] or [*B, H]: a window counts if all its steps do.
 
     Examples:
@@ -80,9 +81,12 @@ class DenoisingLoss(KeyedLoss):
 
         Attributes:
             observation (NestedKey): windows of states. Defaults to ``"observation"``.
+            value (NestedKey): return from each of them on, read where the planner is told returns.
+                Defaults to ``"return_to_go"``.
         """
 
         observation: NestedKey = "observation"
+        value: NestedKey = "return_to_go"
 
     tensor_keys: _AcceptedKeys
     default_keys = _AcceptedKeys
@@ -106,6 +110,8 @@ class DenoisingLoss(KeyedLoss):
         check_step(pseudo_step, planner.horizon)
         self.convert_to_functional(planner.networks, "network", create_target_params=delay)
         self.planner_normalizer, self.planner_changes = planner.normalizer, planner.changes
+        self.planner_condition = planner.condition
+        self._unread = ("value",) if planner.condition is None else ()
         self.levels, self.horizon = planner.levels, planner.horizon
         self.process, self.placement = planner.process, planner.placement
         self.numbers = list(range(len(self.levels)) if only is None else only)
@@ -138,8 +144,11 @@ class DenoisingLoss(KeyedLoss):
         if counted is not None:  # what is masked may be NaN, also in the backward pass
             windows = torch.where(counted[..., None, None], windows, 0.0)
         windows = windows.reshape(-1, *windows.shape[-2:])
+        values = self._values(tensordict, shape, counted)
         with self.network_params.to_module(self.network):
-            losses = [self._level(number, windows).reshape(shape) for number in self.numbers]
+            losses = [
+                self._level(number, windows, values).reshape(shape) for number in self.numbers
+            ]
         out = {"loss_denoising": self._reduce_loss(torch.stack(losses).sum(0), masks)}
         for number, value in zip(self.numbers, losses, strict=True):
             out[f"level_{number}"] = self._reduce_loss(value.detach(), masks, reduction="mean")
@@ -147,9 +156,28 @@ class DenoisingLoss(KeyedLoss):
         self._clear_weakrefs(tensordict, out, "network_params", "target_network_params")
         return out
 
-    def _level(self, number: int, windows: Tensor) -> Tensor:
+    def _values(
+        self, tensordict: TensorDictBase, shape: torch.Size, counted: Tensor | None
+    ) -> Tensor | None:
+        """Returns [B, H] from each state of the windows on, if the networks are told any."""
+        if self.planner_condition is None:
+            return None
+        key = self.tensor_keys.value
+        values = tensordict.get(key, None)
+        if values is None:
+            raise KeyError(f"{key!r} is missing in the tensordict; this planner is told returns.")
+        values = values.reshape(*shape, self.horizon)
+        if counted is not None:
+            values = torch.where(counted[..., None], values, 0.0)
+        return values.reshape(-1, self.horizon)
+
+    def _level(self, number: int, windows: Tensor, values: Tensor | None) -> Tensor:
         """Loss of each window [B] on one level."""
-        clean, mask = self.pieces(number, windows)
+        clean, mask, begin = self.pieces(number, windows)
+        told = {}
+        if values is not None:
+            assert self.planner_condition is not None
+            told["condition"] = self.planner_condition(values.gather(1, begin[:, None])[:, 0])
         change = change_of(self.planner_changes, number)
         clean = encode_states(clean, self.planner_normalizer, change)
         device, shape = clean.device, clean.shape[1:]
@@ -157,13 +185,13 @@ class DenoisingLoss(KeyedLoss):
         noise = draw_rows(lambda rows: torch.randn(rows, *shape, device=device), len(clean))
         noisy = torch.where(mask, clean, self.process.corrupt(clean, noise, time[:, None, None]))
         free = self.levels[number].free(number)  # the others count for nothing
-        predicted = self.network(number, noisy, mask, time, free=free).to(clean.dtype)
+        predicted = self.network(number, noisy, mask, time, free=free, **told).to(clean.dtype)
         error = predicted - self.process.target(clean, noise)[:, free]
         error = error.square().masked_fill(mask[:, free], 0.0)
         total = error.sum((-2, -1)) + (self.next_weight - 1) * error[:, 0].sum(-1)
         return total / clean[0].numel()
 
-    def pieces(self, number: int, windows: Tensor) -> tuple[Tensor, Tensor]:
+    def pieces(self, number: int, windows: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """A random piece of each window on one level's grid, with the pseudo target in it.
 
         Args:
@@ -171,7 +199,8 @@ class DenoisingLoss(KeyedLoss):
             windows (Tensor): [B, H, S], raw units.
 
         Returns:
-            States [B, n, S], raw units, and the mask of the known ones, bool [B, n, 1].
+            States [B, n, S], raw units; the mask of the known ones, bool [B, n, 1]; and where in
+            its window each piece begins, int64 [B].
         """
         level, count, device = self.levels[number], len(windows), windows.device
         rows = torch.arange(count, device=device)
@@ -193,4 +222,4 @@ class DenoisingLoss(KeyedLoss):
         here = torch.arange(level.tokens, device=device) == place.token[:, None]
         here &= pinned[:, None]
         clean = torch.where(here[..., None], moved[:, None], clean)
-        return clean, (mask | here)[..., None]
+        return clean, (mask | here)[..., None], begin
