@@ -26,6 +26,7 @@ from torchrl_rad.experiment import (
     BACKBONE,
     PolicyParts,
     denoising_objective,
+    head_options,
     return_objective,
     run_recipe,
     step_objective,
@@ -39,7 +40,6 @@ def make_objectives(
     _, estimator, planner = policies[trained].policy
     backbone = policies[BACKBONE].policy[-1]
     optim, network, loss = cfg["optim"], cfg["network"], cfg["loss"]
-    steps, head = optim["gradient_steps"], {"lr": optim["head_lr"], "warmup": optim["warmup"]}
 
     def denoising(planner, only=None) -> Objective:
         module = DenoisingLoss(
@@ -60,8 +60,7 @@ def make_objectives(
         "inverse": Objective(
             BCLoss(inverse_dynamics_actor(planner.inverse_dynamics), loss_function="l2"),
             lambda windows: windows[:, :8].reshape(-1),  # enough of them; all would cost more
-            steps=steps,
-            **head,
+            **head_options(cfg),
         ),
     }
     if planner.return_model is not None:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 from torch.nn.parallel import DistributedDataParallel
 from torch.nn.utils import clip_grad_norm_
@@ -21,6 +21,7 @@ from torchrl.objectives.common import LossModule
 from tqdm import tqdm
 
 from torchrl_rad.checkpoint import Checkpointer
+from torchrl_rad.graphs import in_graph
 from torchrl_rad.parallel import (
     drawing_for,
     mean_over_processes,
@@ -56,6 +57,8 @@ class Objective:
         weight_decay (float, optional): Defaults to ``1e-5``.
         ema (float, optional): decay of the target parameters; None if the loss has none.
         bf16 (bool, optional): compute the loss under bfloat16 autocast. Defaults to ``False``.
+        graphs (bool, optional): a step runs as one CUDA graph, and whether a loss is finite is
+            asked where it is logged. Without a GPU it changes nothing else. Defaults to ``False``.
 
     Raises:
         ValueError: ``steps`` is below 1.
@@ -78,17 +81,24 @@ class Objective:
     weight_decay: float = 1e-5
     ema: float | None = None
     bf16: bool = False
+    graphs: bool = False
 
     def __post_init__(self):
         if self.steps < 1:
             raise ValueError(f"steps is {self.steps}; expected 1 or more.")
         parameters = list(self.loss.parameters())
+        on_gpu = self.graphs and parameters[0].is_cuda  # there the rate has to be a tensor
         self.optimizer = torch.optim.AdamW(
-            parameters, lr=self.lr, weight_decay=self.weight_decay, fused=True
+            parameters,
+            lr=torch.tensor(self.lr, device=parameters[0].device) if on_gpu else self.lr,
+            weight_decay=self.weight_decay,
+            fused=True,
+            capturable=on_gpu,
         )
         self.scheduler = LambdaLR(self.optimizer, self._rate)
         self.updater = None if self.ema is None else SoftUpdate(self.loss, eps=self.ema)
         self.module: nn.Module = self.loss  # what is called: the loss, or its data-parallel wrapper
+        self.step = in_graph(self._step) if self.graphs else self._step
 
     def distribute(self) -> None:
         """Averages gradients over the processes of the group from now on."""
@@ -108,20 +118,30 @@ class Objective:
         Raises:
             FloatingPointError: the loss is NaN or Inf.
         """
-        batch = self.prepare(windows)
-        with torch.autocast(windows["observation"].device.type, torch.bfloat16, self.bf16):
+        out = self.step(self.prepare(windows))
+        self.scheduler.step()
+        return dict(out.items())
+
+    def check(self, values: Mapping[str, Tensor | float]) -> None:
+        """Raises FloatingPointError if a loss is NaN or Inf."""
+        total = sum(float(value) for key, value in values.items() if key.startswith("loss_"))
+        if not math.isfinite(total):
+            raise FloatingPointError(f"{type(self.loss).__name__} gave {total}.")
+
+    def _step(self, batch: TensorDictBase) -> TensorDict:
+        """All that a graph can hold: gradients, the optimiser's step and the averaged weights."""
+        device = next(self.loss.parameters()).device.type
+        with torch.autocast(device, torch.bfloat16, self.bf16):
             out = self.module(batch)
-        total = sum(out[key] for key in out.keys() if key.startswith("loss_"))
-        if not total.isfinite():
-            raise FloatingPointError(f"{type(self.loss).__name__} gave {total.item()}.")
+        if not self.graphs:  # there it would wait for the GPU
+            self.check(out)
         self.optimizer.zero_grad()
-        total.backward()
+        sum(out[key] for key in out.keys() if key.startswith("loss_")).backward()
         clip_grad_norm_(self.loss.parameters(), CLIP)
         self.optimizer.step()
-        self.scheduler.step()
         if self.updater is not None:
             self.updater.step()
-        return {key: value.detach() for key, value in out.items()}
+        return TensorDict({key: value.detach() for key, value in out.items()})
 
     def components(self, name: str) -> dict[str, Any]:
         """What a checkpoint holds of it."""
@@ -155,23 +175,31 @@ class Meter:
     """
 
     def __init__(self) -> None:
-        self.sums: dict[str, float] = {}
+        self.sums: dict[str, Any] = {}
         self.count = 0
 
     def add(self, values: Mapping[str, Tensor]) -> None:
-        """Adds one value of each name."""
+        """Adds one value of each name; those on a GPU stay there: to read one waits for it."""
         for key, value in values.items():
-            self.sums[key] = self.sums.get(key, 0.0) + float(value)
+            number = value.double() if value.is_cuda else float(value)
+            self.sums[key] = self.sums.get(key, 0.0) + number
         self.count += 1
+
+    def means(self) -> dict[str, float]:
+        """The means so far."""
+        return {key: float(total) / self.count for key, total in self.sums.items()}
 
     def read(self) -> dict[str, float]:
         """The means, and begins anew."""
-        means = {key: total / self.count for key, total in self.sums.items()}
+        means = self.means()
         self.sums, self.count = {}, 0
         return means
 
     def state_dict(self) -> dict[str, Any]:
-        return {"sums": self.sums, "count": self.count}
+        return {
+            "sums": {key: float(total) for key, total in self.sums.items()},
+            "count": self.count,
+        }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         self.sums, self.count = dict(state["sums"]), state["count"]
@@ -241,14 +269,17 @@ def train(
         for step in range(begin + 1, steps + 1):
             windows = share.of(sample())
             meter.add(_update_all(objectives, windows, step))
+            stopped = wanted_by_any(stop.requested, windows.device or "cpu")
+            saves = step % save_interval == 0 or step == steps or stopped
+            if saves or step % log_interval == 0:
+                _check(objectives, meter.means(), step)
             if step % log_interval == 0 or step == steps:
                 means = mean_over_processes(meter.read(), windows.device or "cpu")
                 if writes:
                     log(step, means)
                 bar.set_postfix_str(_short(means))
             bar.update()
-            stopped = wanted_by_any(stop.requested, windows.device or "cpu")
-            if (step % save_interval == 0 or step == steps or stopped) and writes:
+            if saves and writes:
                 checkpointer.save(step, parts, meta)
             if stopped:
                 wait_for_all()  # until it is saved
@@ -260,15 +291,30 @@ def train(
 def _update_all(objectives, windows: TensorDictBase, step: int) -> dict[str, Tensor]:
     values = {}
     for name, objective in objectives.items():
-        try:
+        with _named(name, step):
             out = objective.update(windows)
-        except FloatingPointError as error:
-            raise FloatingPointError(
-                f"objective {name!r} at step {step}: {error} Resume from the last checkpoint with "
-                "a lower learning rate, or look at the data report."
-            ) from error
         values.update({f"{name}/{key}": value for key, value in out.items()})
     return values
+
+
+def _check(objectives, means: Mapping[str, float], step: int) -> None:
+    """Raises FloatingPointError if a loss of the steps since the last log is not finite."""
+    for name, objective in objectives.items():
+        own = {key: value for key, value in means.items() if key.startswith(f"{name}/")}
+        with _named(name, step):
+            objective.check({key.removeprefix(f"{name}/"): value for key, value in own.items()})
+
+
+@contextmanager
+def _named(name: str, step: int) -> Iterator[None]:
+    """Says of a FloatingPointError whose it is."""
+    try:
+        yield
+    except FloatingPointError as error:
+        raise FloatingPointError(
+            f"objective {name!r} at step {step}: {error} Resume from the last checkpoint with "
+            "a lower learning rate, or look at the data report."
+        ) from error
 
 
 def _short(means: Mapping[str, float]) -> str:

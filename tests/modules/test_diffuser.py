@@ -93,7 +93,7 @@ def test_network_sees_known_states_clean_and_is_told():
 @pytest.mark.parametrize("bound", [0.1, 1.0])
 def test_action_is_the_first_one_of_the_plan_within_bounds(bound):
     planner, td = make(noise="seeded", bound=bound), batch(50, share=0.0)
-    plan = planner.plan(td["observation"], None)
+    plan = planner.plan(td["observation"], [None])
     out = planner(td)
     torch.testing.assert_close(out["action"], plan[:, 0, DIM:].clamp(-bound, bound))
     torch.testing.assert_close(out["plan"], plan[..., :DIM])
@@ -114,7 +114,7 @@ def test_steps_outside_the_horizon():
     planner, td = make(noise="seeded"), batch(3, share=2.0)
     td["target_step"] = torch.tensor([[HORIZON], [0], [-4]])
     plan = planner(td.copy())["plan"]
-    without = planner.plan(td["observation"], None)[..., :DIM]
+    without = planner.plan(td["observation"], [None])[..., :DIM]
     # beyond the horizon: planned without; below 1: the next state
     torch.testing.assert_close(plan[0], without[0], **CLOSE)
     assert torch.equal(plan[1:, 1], td["target"][1:])
@@ -142,7 +142,7 @@ def test_rows_without_a_target_do_not_read_it():
     other["target"][lost] = torch.nan
     other["target_step"][lost] = 10**9
     assert torch.equal(planner(other)["plan"], planner(td.copy())["plan"])
-    without = planner.plan(td["observation"], None)[..., :DIM]
+    without = planner.plan(td["observation"], [None])[..., :DIM]
     torch.testing.assert_close(planner(td)["plan"][lost], without[lost], **CLOSE)
 
 

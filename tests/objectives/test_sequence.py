@@ -416,6 +416,6 @@ def test_training_on_linear_dynamics():
     # plans pass through the target, and move there as the data do
     assert inconsistency(planner, td) < 0.5 * untrained
     # guided plans accelerate more
-    plain = planner.plan(td["observation"], None)[..., -1].mean()
+    plain = planner.plan(td["observation"], [None])[..., -1].mean()
     planner.guide_scale = 2.0
-    assert float(planner.plan(td["observation"], None)[..., -1].mean()) > float(plain) + 0.05
+    assert float(planner.plan(td["observation"], [None])[..., -1].mean()) > float(plain) + 0.05

@@ -23,6 +23,7 @@ from torchrl_rad.experiment.policies import (
 from torchrl_rad.experiment.recipe import (
     MakeObjectives,
     denoising_objective,
+    head_options,
     make_logger,
     return_objective,
     run_recipe,
@@ -45,6 +46,7 @@ __all__ = [
     "check_data",
     "collect_episodes",
     "denoising_objective",
+    "head_options",
     "describe_windows",
     "evaluate_policies",
     "load_starts",

@@ -50,6 +50,7 @@ from torchrl_rad.training import Interrupted, Objective, train
 __all__ = [
     "MakeObjectives",
     "denoising_objective",
+    "head_options",
     "make_logger",
     "return_objective",
     "run_recipe",
@@ -100,30 +101,37 @@ def denoising_objective(cfg: Mapping[str, Any], loss: LossModule) -> Objective:
     optim = cfg["optim"]
     rates = {name: optim[name] for name in ("lr", "warmup", "weight_decay", "ema")}
     bf16 = uses_bf16(optim["precision"], cfg["device"])
-    steps = optim["gradient_steps"]
-    return Objective(loss, lambda windows: windows, steps=steps, bf16=bf16, **rates)
+    common = {"steps": optim["gradient_steps"], "graphs": cfg["compile"]["cudagraphs"]}
+    return Objective(loss, lambda windows: windows, bf16=bf16, **common, **rates)
+
+
+def head_options(cfg: Mapping[str, Any]) -> dict[str, Any]:
+    """How inverse dynamics, step estimator and return model are optimised."""
+    optim = cfg["optim"]
+    return {
+        "lr": optim["head_lr"],
+        "steps": optim["gradient_steps"],
+        "warmup": optim["warmup"],
+        "graphs": cfg["compile"]["cudagraphs"],
+    }
 
 
 def return_objective(cfg: Mapping[str, Any], loss: LossModule, lr: float) -> Objective:
     """L_g, of recorded returns or of the learned value."""
     if cfg["loss"]["value"] == "iql":
         loss.set_keys(value="value")
-    optim = cfg["optim"]
-    steps, warmup = optim["gradient_steps"], optim["warmup"]
-    return Objective(loss, lambda windows: windows, lr=lr, steps=steps, warmup=warmup)
+    return Objective(loss, lambda windows: windows, **{**head_options(cfg), "lr": lr})
 
 
 def step_objective(cfg: Mapping[str, Any], estimator: StepEstimator) -> Objective:
     """L_e, on several pairs of states of each window."""
-    optim, pairs = cfg["optim"], cfg["loss"]["step_pairs"]
+    pairs = cfg["loss"]["step_pairs"]
     return Objective(
         StepEstimationLoss(estimator),
         lambda windows: draw_step_pairs(
             windows["observation"], horizon=estimator.horizon, pairs=pairs
         ),
-        lr=optim["head_lr"],
-        steps=optim["gradient_steps"],
-        warmup=optim["warmup"],
+        **head_options(cfg),
     )
 
 
@@ -246,6 +254,9 @@ def _whole_run(
     if trained:
         plot_curves(run.metrics.rows(), run.path / "curves.png")
     save_policies(run, cfg, policies)
+    if cfg["compile"]["cudagraphs"]:
+        for parts in policies.values():
+            parts.policy[-1].capture()
     rows, episodes = evaluate_policies(run, cfg, task, policies, data)
     titles = {name: f"{name}: {rows[name]['score']:.0f}" for name in rows}
     plain = {name: parts.policy for name, parts in policies.items()}

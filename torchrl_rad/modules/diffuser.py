@@ -160,12 +160,11 @@ class DiffuserPlanner(Planner):
             told = self._told(tensordict, len(state))
             place = self.placement(told.step, 0, *self.levels[0])
             pin = Pin(place.token, told.target, told.found & place.active)
-        plan, width = self.plan(state, pin), state.shape[-1]
+        plan, width = self._planned(state, [pin]), state.shape[-1]
         return plan[..., :width], plan[:, 0, width:].clamp(-self.bound, self.bound)
 
-    def plan(self, state: Tensor, pin: Pin | None) -> Tensor:
-        """Plans [Q, H, S + A] in raw units for raw states [Q, S]."""
-        rows, width = state.shape
+    def plan(self, state: Tensor, pins: Sequence[Pin | None]) -> Tensor:
+        (pin,), (rows, width) = pins, state.shape
         states = state.new_zeros(rows, self.horizon, width)
         mask = torch.zeros(rows, self.horizon, 1, dtype=torch.bool, device=state.device)
         states[:, 0], mask[:, 0] = state, True

@@ -170,7 +170,7 @@ class DiffuserLitePlanner(Planner):
 
     def decide(self, state: Tensor, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
         pins = self._pins(tensordict, len(state)) if self.targets else [None] * len(self.levels)
-        plan = self.plan(state, pins)
+        plan = self._planned(state, pins)
         with torch.autocast(state.device.type, enabled=False):  # too small to be faster
             return plan, self.inverse_dynamics(state, plan[:, 1])
 
@@ -203,7 +203,6 @@ class DiffuserLitePlanner(Planner):
     # the plan
 
     def plan(self, state: Tensor, pins: Sequence[Pin | None]) -> Tensor:
-        """Plans [Q, L, S] for raw states [Q, S]; ``pins`` holds a :class:`Pin` or None a level."""
         seeded = self._generator(state.device)
         networks = self._step_networks(state.device)
         end: Tensor | None = None

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, Self
 
 import torch
 from tensordict import TensorDictBase
@@ -12,6 +12,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torchrl.envs.utils import ExplorationType, exploration_type
 
+from torchrl_rad.graphs import CapturedPlan
 from torchrl_rad.modules.condition import ReturnCondition
 from torchrl_rad.modules.frozen import FrozenCache, StepNetwork, is_hooked, step_network
 from torchrl_rad.modules.normalizer import Normalizer
@@ -121,6 +122,7 @@ class Planner(TensorDictModuleBase):
         self.normalizer, self.return_model = normalizer, return_model
         self.condition = None  # a planner whose networks are told returns sets it
         self._frozen = FrozenCache()
+        self._captured: CapturedPlan | None = None
 
     def decide(self, state: Tensor, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
         """Plans [Q, L, S] and actions [Q, A] for raw states [Q, S]; targets are read from the rest.
@@ -142,6 +144,30 @@ class Planner(TensorDictModuleBase):
         tensordict.set(self.out_keys[0], plan.reshape(*shape, *plan.shape[1:]))
         tensordict.set(self.out_keys[1], action.reshape(*shape, action.shape[-1]))
         return tensordict
+
+    def plan(self, state: Tensor, pins: Sequence[Pin | None]) -> Tensor:
+        """Plans [Q, L, D] in raw units for raw states [Q, S].
+
+        Args:
+            state (Tensor): flat and finite.
+            pins (sequence of Pin): what each level is told of the target; None if nothing.
+        """
+        raise NotImplementedError
+
+    def capture(self) -> Self:
+        """Plans run as CUDA graphs from now on, one for each number of rows; gives itself.
+
+        What comes before and after, such as looking up a target's episode, stays as it is, and so
+        do plans of the same noise each time. Call it again where settings such as ``candidates``
+        were changed. Without a GPU it changes nothing.
+        """
+        self._captured = CapturedPlan()
+        return self
+
+    def _planned(self, state: Tensor, pins: Sequence[Pin | None]) -> Tensor:
+        if self._captured is None or self._is_seeded():
+            return self.plan(state, pins)
+        return self._captured(self.plan, state, pins)
 
     def _told(self, tensordict: TensorDictBase, rows: int) -> Told:
         """The targets of all rows, flat; they must be there."""
@@ -185,12 +211,14 @@ class Planner(TensorDictModuleBase):
 
     # noise and candidates
 
+    def _is_seeded(self) -> bool:
+        """Whether the same noise is asked for at each call."""
+        deterministic = exploration_type() == ExplorationType.DETERMINISTIC
+        return self.noise == "seeded" or (self.noise == "sample" and deterministic)
+
     def _generator(self, device: torch.device) -> torch.Generator | None:
         """A source of the same noise at each call, where that is asked for."""
-        deterministic = exploration_type() == ExplorationType.DETERMINISTIC
-        if self.noise == "seeded" or (self.noise == "sample" and deterministic):
-            return torch.Generator(device=device).manual_seed(0)
-        return None
+        return torch.Generator(device=device).manual_seed(0) if self._is_seeded() else None
 
     def _draw(
         self, rows: int, copies: int, tokens: int, generator: torch.Generator | None, like: Tensor
