@@ -21,7 +21,8 @@ from torchrl_rad.checkpoint import (
     verify_manifest,
     write_json,
 )
-from torchrl_rad.data.sharded import load_database
+from torchrl_rad.data.database import ExpertDatabase
+from torchrl_rad.data.sharded import ShardedExpertDatabase, load_database
 from torchrl_rad.modules.diffuser import DiffuserPlanner
 from torchrl_rad.modules.diffuser_lite import DiffuserLitePlanner
 from torchrl_rad.modules.inverse import InverseDynamics
@@ -61,7 +62,8 @@ def build_policy(
             :class:`GoalReward`; the rules ``"random"``, ``"nearest"`` and ``"none"`` are those of
             :class:`PlainTargetModule`. The horizon of ``"target"`` holds for the estimator too; it
             is the planner's if it is left out.
-        database (ExpertDatabase or ShardedExpertDatabase, optional): the demonstrations, needed with a target.
+        database (ExpertDatabase or ShardedExpertDatabase, optional): the demonstrations, needed
+            with a target.
 
     Raises:
         ValueError: the planner's kind is none of these; a target is described and there is no
@@ -268,8 +270,8 @@ def load_policy(
 
     Args:
         folder (path): written by :func:`save_policy`.
-        database (ExpertDatabase or ShardedExpertDatabase, optional): used in place of the saved one, on purpose: other rows,
-            other behaviour.
+        database (ExpertDatabase or ShardedExpertDatabase, optional): used in place of the saved
+            one, on purpose: other rows, other behaviour.
         device (str, optional): of the networks. Defaults to ``"cpu"``.
 
     Raises:

@@ -346,7 +346,7 @@ class ShardedExpertDatabase(AskedReplayBuffer):
     def _share(self) -> None:
         """Storage and sampler get to know what is there."""
         tables = [
-            (database.storage[:], shard.shift)
+            (database.storage[:].exclude("index"), shard.shift)
             for database, shard in zip(self._opened, self._list.shards, strict=True)
         ]
         if self._tail is not None:

@@ -83,7 +83,7 @@ class WindowedRule:
         """As :meth:`_followed`."""
         left = self._read(self.remaining, rows)
         low, high = left.clamp_max(self.min_offset), left.clamp_max(self.horizon - 1)
-        window = self.values.windows(rows.flatten(), self.horizon).view(*rows.shape, -1)
+        window = self.values.windows(rows.flatten(), self.horizon).view(*rows.shape, self.horizon)
         step = torch.arange(self.horizon, device=rows.device)
         inside = (low[..., None] <= step) & (step <= high[..., None])  # [Q, k, H]
         peak = torch.where(inside, window, -torch.inf).amax(-1)
