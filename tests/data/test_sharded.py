@@ -515,6 +515,15 @@ def assert_workers_serve(workers, folder):
     return plain, many, states
 
 
+def assert_a_hidden_shard_is_named(many, states):
+    many.extend(walks(2, seed=8))
+    many.flush()
+    many.shards[-1].rename(many.folder / "elsewhere")  # before the workers have opened it
+    with pytest.raises(CheckpointError, match=f"{many.shards[-1].name} is missing.* shared drive"):
+        many.retrieve(states)
+    many.close()
+
+
 def test_shards_in_several_processes(tmp_path):
     plain, many, states = assert_workers_serve("process", tmp_path / "many")
     for process in many.sampler.homes[0].pool._processes.values():
@@ -522,11 +531,7 @@ def test_shards_in_several_processes(tmp_path):
     with pytest.raises(RuntimeError, match="a process that searches shards ended: it was killed"):
         many.retrieve(states)
     assert_same_answers(plain, many, states, RULES[-1])  # by new ones
-    many.close()
-    many.shards[3].rename(tmp_path / "elsewhere")  # which the workers do not see now
-    with pytest.raises(CheckpointError, match="shard-000003 is missing.* on a shared drive"):
-        many.retrieve(states)
-    many.close()
+    assert_a_hidden_shard_is_named(many, states)
 
 
 def test_shards_in_ray_actors(tmp_path):
@@ -534,10 +539,7 @@ def test_shards_in_ray_actors(tmp_path):
     ray.init(num_cpus=2, include_dashboard=False, log_to_driver=False)
     try:
         _, many, states = assert_workers_serve("ray", tmp_path / "many")
-        many.close()
-        many.shards[3].rename(tmp_path / "elsewhere")
-        with pytest.raises(CheckpointError, match="shard-000003 is missing.* on a shared drive"):
-            many.retrieve(states)
+        assert_a_hidden_shard_is_named(many, states)
     finally:
         ray.shutdown()
 

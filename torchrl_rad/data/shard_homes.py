@@ -179,7 +179,8 @@ class RayHome:
                 'workers="ray" needs Ray: pip install "torchrl_rad[ray]", or use '
                 'workers="process" for processes of this machine.'
             ) from error
-        self.ray, self.actor = ray, ray.remote(ShardGroup).remote(config)
+        self.ray: Any = ray
+        self.actor = self.ray.remote(ShardGroup).remote(config)
 
     def call(self, name: str, *args: Any) -> Callable[[], Any]:
         return partial(self.ray.get, getattr(self.actor, name).remote(*args))

@@ -70,7 +70,7 @@ class ShardSampler(RetrievalSampler):
         self._check_width(storage, query)
         asked = query.detach().to("cpu", torch.float64).numpy()
         try:
-            waits = [home.call("nearest", asked, k) for home in self._ready()]
+            waits = [home.call("nearest", asked, k) for home in self._told_homes()]
             found = [tuple(map(torch.from_numpy, wait())) for wait in waits]
         except BrokenExecutor as error:
             self.close()
@@ -117,7 +117,7 @@ class ShardSampler(RetrievalSampler):
 
     # where the shards are
 
-    def _ready(self) -> list[Home]:
+    def _told_homes(self) -> list[Home]:
         """The homes, each with its shards, and one for the tail."""
         if self.homes is None:
             self.homes = make_homes(self.workers, self.count, self.config)

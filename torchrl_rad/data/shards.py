@@ -40,7 +40,7 @@ class Shard:
     Attributes:
         path: of its folder, seen from that of the list.
         rows: how many it has.
-        episodes: lowest and highest episode id, as the whole database has them.
+        last: highest episode id, as the whole database has it.
         shift: what is added to the ids in its file for that.
         width: entries of a state.
         mean, spread, low, high: of each entry of its states: mean, sum of the squared distances
@@ -49,7 +49,7 @@ class Shard:
 
     path: str
     rows: int
-    episodes: tuple[int, int]
+    last: int
     shift: int
     width: int
     mean: list[float]
@@ -77,7 +77,7 @@ class ShardList:
 
     def free_id(self) -> int:
         """The lowest episode id above all that are in use."""
-        return max((shard.episodes[1] + 1 for shard in self.shards), default=0)
+        return max((shard.last + 1 for shard in self.shards), default=0)
 
 
 def read_list(folder: Path) -> ShardList:
@@ -100,9 +100,8 @@ def read_list(folder: Path) -> ShardList:
             "reads; fill the database anew."
         )
     try:
-        shards = (Shard(**entry) for entry in content["shards"])
-        whole = tuple(dataclasses.replace(s, episodes=tuple(s.episodes)) for s in shards)
-        return ShardList(content["config"], whole)
+        shards = [Shard(**entry) for entry in content["shards"]]
+        return ShardList(content["config"], tuple(shards))
     except (KeyError, TypeError) as error:
         raise CheckpointError(f"{folder / LIST} is damaged: {error!r}.") from error
 
@@ -135,7 +134,9 @@ def open_shard(folder: Path, shard: Shard, gamma: float, key: Any) -> ExpertData
     return database
 
 
-def check_fits(path: Path, database: ExpertDatabase, gamma: float, key: Any, width: int) -> None:
+def check_fits(
+    path: Path | None, database: ExpertDatabase, gamma: float, key: Any, width: int
+) -> None:
     """Checks that a database can be a shard.
 
     Raises:
@@ -160,8 +161,9 @@ def describe(path: str, database: ExpertDatabase, key: Any, shift: int) -> Shard
     rows = database.storage[:]
     ids, states = rows["episode"], rows.get(key)
     mean, spread, low, high = (column.tolist() for column in moments(states))
-    ends = (int(ids.min()) + shift, int(ids.max()) + shift)
-    return Shard(path, len(ids), ends, shift, states.shape[-1], mean, spread, low, high)
+    return Shard(
+        path, len(ids), int(ids.max()) + shift, shift, states.shape[-1], mean, spread, low, high
+    )
 
 
 def moments(states: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:

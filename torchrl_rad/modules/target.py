@@ -313,10 +313,9 @@ class RetrievalTargetModule(TensorDictModuleBase):
     def _make_rule(self, rows: TensorDictBase | ShardColumns) -> TargetRule:
         """The rule on the content of the database, [N]."""
         if isinstance(rows, ShardColumns):
-            columns = (rows["return_to_go"], rows["remaining"])
             ahead = self.ahead if self.rule == "followed" else None
-            limits = (self.horizon, self.min_offset, self.tolerance, ahead)
-            return WindowedRule(*columns, *limits)
+            returns, left = rows["return_to_go"], rows["remaining"]
+            return WindowedRule(returns, left, self.horizon, self.min_offset, self.tolerance, ahead)
         values, remaining = rows["return_to_go"], rows["remaining"]
         if self.goal_key is not None:
             limits = (self._experts(), self.horizon)
