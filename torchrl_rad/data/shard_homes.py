@@ -15,7 +15,6 @@ import torch
 from torch import Tensor
 
 from torchrl_rad.data.shards import Shard, open_shard
-from torchrl_rad.retrieval import search
 from torchrl_rad.retrieval.merged import Found, merged
 from torchrl_rad.retrieval.sampler import RetrievalSampler
 from torchrl_rad.retrieval.search import TreeIndex
@@ -23,6 +22,7 @@ from torchrl_rad.retrieval.search import TreeIndex
 __all__ = ["WORKERS", "Home", "ScaledSampler", "ShardGroup", "make_homes"]
 
 WORKERS = ("process", "ray")
+FOUND_ENTRIES = 2**22  # rows found in all shards that are held at a time
 SPARE = 16  # rows of a shard looked at beyond twice its share of the neighbours
 
 Scale = tuple[np.ndarray, np.ndarray]  # mean and deviation of a state, float64 [S]
@@ -80,7 +80,7 @@ class ShardGroup:
         """
         if not self.parts:
             return np.empty((len(query), 0)), np.empty((len(query), 0), dtype=np.int64)
-        most = max(1, search.SCAN_ENTRIES // (k * len(self.parts)))
+        most = max(1, FOUND_ENTRIES // (k * len(self.parts)))
         found = [self._merged(part, k) for part in torch.from_numpy(query).split(most)]
         near, rows = (torch.cat(column) for column in zip(*found, strict=True))
         return near.numpy(), rows.numpy()

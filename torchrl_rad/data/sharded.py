@@ -198,6 +198,7 @@ class ShardedExpertDatabase(AskedReplayBuffer):
         checked = ExpertDatabase(LazyTensorStorage(len(steps)), self.gamma, self.expert, sampler)
         checked.extend(steps)
         rows = checked.storage[:].exclude("index")
+        _release(checked)
         longest = int(stored_lengths(rows).max())
         if longest > self.rows_per_shard:
             raise ValueError(
@@ -284,7 +285,10 @@ class ShardedExpertDatabase(AskedReplayBuffer):
     def _append(self, shard: Any) -> None:
         longer = ShardList(self._list.config, (*self._list.shards, shard))
         longer.write(self.folder)
-        self._state, self._tail = list_state(self.folder), None
+        self._state = list_state(self.folder)
+        if self._tail is not None:
+            _release(self._tail)
+            self._tail = None
         self._take(longer)
 
     def _check_single(self) -> None:
@@ -448,6 +452,13 @@ class ShardedExpertDatabase(AskedReplayBuffer):
 
 def _as_it_is(rows: TensorDictBase) -> TensorDictBase:
     return rows
+
+
+def _release(database: ExpertDatabase) -> None:
+    """Lets its memory go with its last name."""
+    # buffer and storage refer to each other, so that it would stay until garbage is collected:
+    # gigabytes, in a stream
+    database.storage._attached_entities.clear()
 
 
 def _reopen(cls: type, folder: str, kwargs: dict[str, Any], search: dict[str, Any]) -> Any:
