@@ -95,18 +95,19 @@ def ask(folder: Path, calls: int) -> dict:
     results: dict = {"open_s": opened}
     for batch in (1, 128):
         states = driven(min(EPISODE, calls), batch)
-        times, works = [], []
+        times, works, shares = [], [], []
         for state in states if batch == 1 else states[: max(5, calls // 5)]:
             begin, work = perf_counter(), process_time()
             out = select(TensorDict({"observation": state}, [batch]))
             times.append(1e3 * (perf_counter() - begin))
             works.append(1e3 * (process_time() - work))
-            assert out["found"].all()
+            shares.append(float(out["found"].float().mean()))
         if batch == 1:  # the first call makes the search structures
             results["first_query_s"], results["first_query_cpu_s"] = times[0] / 1e3, works[0] / 1e3
             times, works = times[1:], works[1:]
         results[f"batch_{batch}"] = {
             "calls": len(times),
+            "found": float(np.mean(shares)),
             "ms": dict(zip(("p50", "p95"), np.percentile(times, [50, 95]), strict=True)),
             "cpu_ms": dict(zip(("p50", "p95"), np.percentile(works, [50, 95]), strict=True)),
         }
@@ -127,6 +128,8 @@ def compare(folder: Path, rows: int) -> dict:
     same = [
         (out["target_index"][i].item(), out["offset"][i].item(), out["similarity"][i].item())
         == (target, target - anchor, float(np.float32(near)))
+        if out["found"][i]
+        else target == -1
         for i, (target, anchor, near) in enumerate(truth)
     ]
     return {"queries": ORACLE, "equal": sum(same)}
@@ -149,6 +152,8 @@ def scanned(rows: int, queries: np.ndarray) -> list[tuple[int, int, float]]:
             found = np.concatenate([best[number], found], 1)
             best[number] = found[:, np.lexsort((found[1], -found[0]))[:K]]
         first += len(flat)
+    none = np.array([[0.0], [-1], [-np.inf], [-1]])  # where there is no neighbour
+    best = [np.concatenate([found, none], 1) for found in best]
     chosen = [found[:, np.lexsort((found[1], -found[0], -found[2]))[0]] for found in best]
     return [(int(target), int(row), near) for near, row, _, target in chosen]
 

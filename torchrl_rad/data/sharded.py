@@ -52,7 +52,7 @@ class ShardedExpertDatabase(AskedReplayBuffer):
     Others that have the folder open see a shard as soon as it is closed. What is in no shard yet is
     lost with the process.
 
-    In memory are, a row, the entries compared (8 bytes each) and some 13 bytes for the tree where
+    In memory are, a row, the entries compared (8 bytes each) and some 16 bytes for the tree where
     at most three are compared, else 4 bytes and, with ``normalize=True``, 12 for each entry.
 
     ``deepcopy`` gives the same database; pickling passes the folder, under which another process
