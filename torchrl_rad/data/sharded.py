@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import errno
-import hashlib
-import json
 import os
 import shutil
 from collections.abc import Callable, Iterator
@@ -16,15 +14,15 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
-from torchrl_rad._files import STAGE, read_json, staged_folder
-from torchrl_rad.data.asking import AskedReplayBuffer
+from torchrl_rad._files import STAGE
 from torchrl_rad.data.checks import check_same_columns, flat_steps
 from torchrl_rad.data.database import ExpertDatabase
 from torchrl_rad.data.growth import stored_lengths
-from torchrl_rad.data.saved import build, require_space
+from torchrl_rad.data.saved import build
 from torchrl_rad.data.shard_homes import WORKERS, ScaledSampler
 from torchrl_rad.data.shard_sampler import ShardSampler
 from torchrl_rad.data.shard_storage import ShardColumns, ShardStorage
+from torchrl_rad.data.sharded_saving import SavedShards
 from torchrl_rad.data.shards import (
     LIST,
     ShardList,
@@ -39,7 +37,7 @@ from torchrl_rad.retrieval.sampler import RetrievalSampler, storage_revision
 __all__ = ["ShardedExpertDatabase", "load_database"]
 
 
-class ShardedExpertDatabase(AskedReplayBuffer):
+class ShardedExpertDatabase(SavedShards):
     """Demonstrations on disk, in shards of whole episodes, searched as one database.
 
     It answers what :class:`~torchrl_rad.data.ExpertDatabase` answers, exactly, with as many rows as
@@ -364,11 +362,6 @@ class ShardedExpertDatabase(AskedReplayBuffer):
         return len(self._storage)
 
     @property
-    def shards(self) -> list[Path]:
-        """Folders of the shards, in the order of their rows."""
-        return [(self.folder / shard.path).resolve() for shard in self._list.shards]
-
-    @property
     def width(self) -> int:
         """Number of entries of a state.
 
@@ -397,58 +390,6 @@ class ShardedExpertDatabase(AskedReplayBuffer):
         self.flush()
         self._sampler.close()
 
-    # saving, copying, sending
-
-    def digest(self) -> str:
-        """sha256 of settings and shards, how the rows are cut into these included."""
-        self.flush()
-        config = {name: self._list.config[name] for name in ("gamma", "expert", "sampler")}
-        hashed = hashlib.sha256(json.dumps(config, sort_keys=True).encode())
-        for path, shard in zip(self.shards, self._list.shards, strict=True):
-            hashed.update(f"{read_json(path / 'manifest.json')['digest']} {shard.shift}".encode())
-        return hashed.hexdigest()
-
-    def dumps(self, path: str | Path) -> None:
-        """Copies the whole to another folder, which appears only when it is complete.
-
-        Args:
-            path (path): must not exist.
-
-        Raises:
-            FileExistsError: it exists.
-            OSError: it cannot be written.
-        """
-        with self._replay_lock:
-            self.flush()
-            path = Path(path).absolute()
-            path.parent.mkdir(parents=True, exist_ok=True)
-            files = [file for shard in self.shards for file in shard.rglob("*")]
-            require_space(path.parent, sum(file.stat().st_size for file in files))
-            with staged_folder(path) as stage:
-                named = []
-                for number, (own, shard) in enumerate(
-                    zip(self.shards, self._list.shards, strict=True)
-                ):
-                    name = f"shard-{number:06d}"
-                    shutil.copytree(own, stage / name)
-                    named.append(type(shard)(**{**vars(shard), "path": name}))
-                ShardList(self._list.config, tuple(named)).write(stage)
-
-    def __copy__(self) -> Self:
-        return self
-
-    def __deepcopy__(self, memo: dict[int, Any]) -> Self:
-        return self
-
-    def __reduce__(self) -> tuple:
-        self.flush()
-        transform = (
-            self._transform if self._transform is not None and len(self._transform) else None
-        )
-        kwargs = {"batch_size": self._batch_size, "transform": transform}
-        search = {"k": self._sampler.k, "threshold": self._sampler.threshold}
-        return _reopen, (type(self), str(self.folder), kwargs, search)
-
 
 def _as_it_is(rows: TensorDictBase) -> TensorDictBase:
     return rows
@@ -459,13 +400,6 @@ def _release(database: ExpertDatabase) -> None:
     # buffer and storage refer to each other, so that it would stay until garbage is collected:
     # gigabytes, in a stream
     database.storage._attached_entities.clear()
-
-
-def _reopen(cls: type, folder: str, kwargs: dict[str, Any], search: dict[str, Any]) -> Any:
-    database = cls(folder, **kwargs)
-    for name, value in search.items():
-        setattr(database.sampler, name, value)
-    return database
 
 
 def load_database(path: str | Path) -> ExpertDatabase | ShardedExpertDatabase:
