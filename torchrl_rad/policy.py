@@ -22,6 +22,7 @@ from torchrl_rad.checkpoint import (
     write_json,
 )
 from torchrl_rad.data.database import ExpertDatabase
+from torchrl_rad.data.sharded import ShardedExpertDatabase, load_database
 from torchrl_rad.modules.diffuser import DiffuserPlanner
 from torchrl_rad.modules.diffuser_lite import DiffuserLitePlanner
 from torchrl_rad.modules.inverse import InverseDynamics
@@ -37,6 +38,8 @@ from torchrl_rad.retrieval.goals import GoalReward
 
 __all__ = ["build_policy", "fit_scales", "load_policy", "save_policy", "with_goals"]
 
+Database = ExpertDatabase | ShardedExpertDatabase
+
 FORMAT = 1
 # settings that must be known before a planner is built, by its kind
 PLANNERS: dict[str, dict[str, Any]] = {
@@ -46,7 +49,7 @@ PLANNERS: dict[str, dict[str, Any]] = {
 
 
 def build_policy(
-    description: dict[str, Any], database: ExpertDatabase | None = None
+    description: dict[str, Any], database: Database | None = None
 ) -> TensorDictSequential:
     """A policy with fresh weights: TS, SE and PL, or PL alone where there is no ``"target"``.
 
@@ -59,7 +62,8 @@ def build_policy(
             :class:`GoalReward`; the rules ``"random"``, ``"nearest"`` and ``"none"`` are those of
             :class:`PlainTargetModule`. The horizon of ``"target"`` holds for the estimator too; it
             is the planner's if it is left out.
-        database (ExpertDatabase, optional): the demonstrations, needed with a target.
+        database (ExpertDatabase or ShardedExpertDatabase, optional): the demonstrations, needed
+            with a target.
 
     Raises:
         ValueError: the planner's kind is none of these; a target is described and there is no
@@ -111,7 +115,7 @@ def _diffuser_lite(
     action_dim: int,
     bound: float,
     options: dict[str, Any],
-    database: ExpertDatabase | None,
+    database: Database | None,
 ) -> DiffuserLitePlanner:
     difference = Normalizer.identity(len(states.mean))
     inverse = InverseDynamics(states, difference, action_dim, bound=bound)
@@ -130,7 +134,7 @@ def _diffuser(
     return DiffuserPlanner(states, action_dim, return_model=model, bound=bound, **options)
 
 
-def _select(database: ExpertDatabase, options: dict[str, Any]) -> TensorDictModuleBase:
+def _select(database: Database, options: dict[str, Any]) -> TensorDictModuleBase:
     names = (*OUT_KEYS, "target_offset", "target_source")
     if options.get("rule") in ("random", "nearest", "none"):
         return PlainTargetModule(database, options["rule"], out_keys=names)
@@ -141,7 +145,7 @@ def _select(database: ExpertDatabase, options: dict[str, Any]) -> TensorDictModu
 
 def with_goals(
     policy: TensorDictSequential,
-    database: ExpertDatabase,
+    database: Database,
     goal_key: NestedKey = "goal",
     goal_reward: GoalReward | None = None,
 ) -> TensorDictSequential:
@@ -153,7 +157,8 @@ def with_goals(
     Args:
         policy (TensorDictSequential): of :func:`build_policy`, with targets; its weights are
             shared.
-        database (ExpertDatabase): of all recorded episodes, not only those that reach one goal.
+        database (ExpertDatabase): of all recorded episodes, not only those that reach one goal; not
+            a sharded one.
         goal_key (NestedKey, optional): the goal [*B, G]. Defaults to ``"goal"``.
         goal_reward (GoalReward, optional): when it is reached. Defaults to within 0.5 of it.
 
@@ -225,7 +230,7 @@ def save_policy(
     folder: str | Path,
     policy: TensorDictSequential,
     description: dict[str, Any],
-    database: ExpertDatabase | None = None,
+    database: Database | None = None,
 ) -> None:
     """Saves a policy: description, weights and database, with the sha256 of each file.
 
@@ -236,7 +241,7 @@ def save_policy(
         folder (path): parents are made if need be.
         policy (TensorDictSequential): built by :func:`build_policy` with this description.
         description (dict): see there; further entries are kept.
-        database (ExpertDatabase, optional): saved beside the weights.
+        database (ExpertDatabase or ShardedExpertDatabase, optional): saved beside the weights.
 
     Raises:
         CheckpointError: the disk is full or the folder cannot be written.
@@ -259,14 +264,14 @@ def save_policy(
 
 
 def load_policy(
-    folder: str | Path, database: ExpertDatabase | None = None, device: str | torch.device = "cpu"
+    folder: str | Path, database: Database | None = None, device: str | torch.device = "cpu"
 ) -> TensorDictSequential:
     """Loads a saved policy; with the same seed it acts as it did where it was saved.
 
     Args:
         folder (path): written by :func:`save_policy`.
-        database (ExpertDatabase, optional): used in place of the saved one, on purpose: other rows,
-            other behaviour.
+        database (ExpertDatabase or ShardedExpertDatabase, optional): used in place of the saved
+            one, on purpose: other rows, other behaviour.
         device (str, optional): of the networks. Defaults to ``"cpu"``.
 
     Raises:
@@ -288,7 +293,7 @@ def load_policy(
             f"reads {FORMAT}. Load it with the version that saved it."
         )
     if database is None and description["database"] is not None:
-        database = ExpertDatabase.loads(folder / "database")
+        database = load_database(folder / "database")
         if database.digest() != description["database"]:
             raise CheckpointError(
                 f"{folder / 'database'} is not the database that this policy was saved with "

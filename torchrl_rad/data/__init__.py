@@ -26,6 +26,7 @@ from torchrl_rad.data.pointmaze import collect_pointmaze, pointmaze_dataset
 from torchrl_rad.data.regions import enters_region, without_region
 from torchrl_rad.data.report import DataReport
 from torchrl_rad.data.report import report as data_report  # "report" is the module
+from torchrl_rad.data.sharded import ShardedExpertDatabase, load_database
 from torchrl_rad.data.sources import concatenate_steps, find_dataset, load_dataset
 from torchrl_rad.data.windows import Window, WindowSampler, window_buffer
 
@@ -34,6 +35,7 @@ __all__ = [
     "DataReport",
     "Expert",
     "ExpertDatabase",
+    "ShardedExpertDatabase",
     "Window",
     "WindowSampler",
     "check_content",
@@ -48,6 +50,7 @@ __all__ = [
     "first_hit_within",
     "has_successor",
     "join_stream",
+    "load_database",
     "load_dataset",
     "load_hdf5",
     "load_minari",

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable
 from typing import Any, NoReturn
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.data import LazyTensorStorage, TensorStorage
 
@@ -316,11 +316,6 @@ class ExpertDatabase(SavedReplayBuffer):
     # asking
 
     @property
-    def lock(self) -> Any:
-        """Re-entrant, held while rows are written: hold it over reads that belong together."""
-        return self._replay_lock
-
-    @property
     def width(self) -> int:
         """Number of entries of a state.
 
@@ -329,35 +324,3 @@ class ExpertDatabase(SavedReplayBuffer):
         """
         self._require_rows("asking for the width of its states")
         return self._storage[:][self._sampler.key].shape[-1]
-
-    @property
-    def device(self) -> torch.device:
-        """Where the rows are."""
-        device = self._storage.device
-        return torch.device("cpu" if device in ("auto", None) else device)
-
-    def retrieve(self, query: Tensor) -> TensorDict:
-        """The neighbours of each query: as :meth:`sample`, with a search in place of the draw.
-
-        Args:
-            query (Tensor): [*B, S], raw units.
-
-        Returns:
-            TensorDict [*B, k]: ``index`` (int64, -1 where there is none), ``similarity`` (float32),
-            ``valid`` (bool) and the columns of the rows found (those of row 0 where ``valid`` is
-            False).
-
-        Raises:
-            RuntimeError: the database is empty.
-            ValueError: the query has another width than the rows.
-        """
-        with self._replay_lock:
-            self._require_rows("asking for neighbours")
-            index, info = self._sampler.search(self._storage, query)
-            rows = index.clamp_min(0).reshape(-1).to(self.device)
-            hits = self._storage.get(rows).reshape(index.shape)
-        if self._transform is not None and len(self._transform):
-            hits = self._transform(hits)
-        hits = hits.to(query.device).exclude("index")
-        hits.update({"index": index, **info})
-        return hits

@@ -18,6 +18,7 @@ from torch import Tensor
 from torchrl.data import LazyMemmapStorage, LazyTensorStorage, TensorDictReplayBuffer, TensorStorage
 
 from torchrl_rad._files import staged_folder, write_json
+from torchrl_rad.data.asking import AskedReplayBuffer
 from torchrl_rad.data.experts import Expert
 from torchrl_rad.data.saved import FORMAT, build, read_config, replaceable, require_space
 from torchrl_rad.retrieval.sampler import storage_revision
@@ -25,7 +26,7 @@ from torchrl_rad.retrieval.sampler import storage_revision
 __all__ = ["SavedReplayBuffer"]
 
 
-class SavedReplayBuffer(TensorDictReplayBuffer):
+class SavedReplayBuffer(AskedReplayBuffer):
     """The part of :class:`~torchrl_rad.data.ExpertDatabase` that saves, copies and sends it."""
 
     gamma: float
@@ -36,10 +37,6 @@ class SavedReplayBuffer(TensorDictReplayBuffer):
         super().__init__(**kwargs)
         self.path: Path | None = None  # where this content is saved
         self._saved: tuple | None = None
-
-    def _require_rows(self, purpose: str) -> None:
-        if len(self) == 0:
-            raise RuntimeError(f"the database is empty: extend it with episodes before {purpose}.")
 
     def digest(self) -> str:
         """sha256 of the rows, discount, expert rule and search settings.

@@ -192,7 +192,7 @@ class DiffuserLitePlanner(Planner):
         database = self.database
         if database is None or len(database) == 0:
             return target
-        rows = database[:]
+        rows = database.columns
         place = index.clamp_min(0).to(database.device)
         shift = shift.to(database.device)
         place = place + shift.maximum(-rows["step"][place]).minimum(rows["remaining"][place])

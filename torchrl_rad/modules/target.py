@@ -15,6 +15,8 @@ from torchrl.envs.transforms import TensorDictPrimer
 
 from torchrl_rad.data.database import ExpertDatabase
 from torchrl_rad.data.experts import select_episodes
+from torchrl_rad.data.shard_storage import ShardColumn, ShardColumns
+from torchrl_rad.data.sharded import ShardedExpertDatabase
 from torchrl_rad.modules.kept import KEPT, keep_or_renew, kept_primer
 from torchrl_rad.retrieval.goal_rules import GoalRule
 from torchrl_rad.retrieval.goals import GoalReward, GoalTable
@@ -25,6 +27,7 @@ from torchrl_rad.retrieval.rules import (
     followed_rule,
     highest_rule,
 )
+from torchrl_rad.retrieval.windowed import WindowedRule
 
 __all__ = ["RetrievalTargetModule"]
 
@@ -35,7 +38,7 @@ QUERIES = 4096  # asked at a time: each has k neighbours
 class _Columns(NamedTuple):
     source: object  # the search structure that they belong to
     version: int  # of the database
-    states: Tensor
+    states: Tensor | ShardColumn
     rule: TargetRule
 
 
@@ -82,7 +85,8 @@ class RetrievalTargetModule(TensorDictModuleBase):
     ==================  ========================  ==================================================
 
     Args:
-        database (ExpertDatabase): the demonstrations.
+        database (ExpertDatabase or ShardedExpertDatabase): the demonstrations. A sharded one takes
+            neither ``goal_key`` nor ``among``.
         horizon (int, optional): H; a target is at most H - 1 recorded steps ahead. The planner's H,
             or less: the paper's rule does not count the way, so that with a large one it leaves
             what pays for what pays later. Defaults to ``129``.
@@ -128,7 +132,7 @@ class RetrievalTargetModule(TensorDictModuleBase):
 
     def __init__(
         self,
-        database: ExpertDatabase,
+        database: ExpertDatabase | ShardedExpertDatabase,
         horizon: int = 129,
         rule: Literal["highest", "followed"] = "highest",
         tolerance: float = 0.0,
@@ -170,6 +174,11 @@ class RetrievalTargetModule(TensorDictModuleBase):
             raise ValueError(f"tolerance is {tolerance}; with a goal_key it must be 0.")
         if goal_key is None and goal_reward is not None:
             raise ValueError("goal_reward is given without a goal_key; pass both or neither.")
+        if isinstance(database, ShardedExpertDatabase) and (goal_key is not None or among > 1):
+            raise ValueError(
+                "goal_key and among need a table of all rows in memory, which a sharded database "
+                "does not have; pass an ExpertDatabase, or leave both out."
+            )
         # a handle, out of reach of parameters, buffers and state_dict
         self.__dict__["database"] = database
         self.horizon, self.rule, self.tolerance, self.ahead = horizon, rule, tolerance, ahead
@@ -221,9 +230,9 @@ class RetrievalTargetModule(TensorDictModuleBase):
         """Episode and step of the neighbours through which targets were reached, [Q, 2]."""
         if not bool(hit.any()):
             return index.new_full((len(index), 2), -1)
-        rows = self.database[:]
+        rows = self.database.columns
         place = (index - offset).clamp_min(0).to(self.database.device)
-        columns = [rows[name].index_select(0, place).to(index) for name in ("episode", "step")]
+        columns = [rows[name][place].to(index) for name in ("episode", "step")]
         return torch.where(hit[:, None], torch.stack(columns, -1), -1)
 
     def _goals(self, tensordict: TensorDictBase, shape: torch.Size) -> Tensor:
@@ -296,13 +305,17 @@ class RetrievalTargetModule(TensorDictModuleBase):
         source = self.database.sampler.build(self.database.storage)
         version, columns = self.database.version, self._columns
         if columns is None or columns.source is not source or columns.version != version:
-            rows = self.database[:]
+            rows = self.database.columns
             key, rule = self.database.sampler.key, self._make_rule(rows)
             self._columns = columns = _Columns(source, version, rows[key], rule)
         return columns
 
-    def _make_rule(self, rows: TensorDictBase) -> TargetRule:
+    def _make_rule(self, rows: TensorDictBase | ShardColumns) -> TargetRule:
         """The rule on the content of the database, [N]."""
+        if isinstance(rows, ShardColumns):
+            ahead = self.ahead if self.rule == "followed" else None
+            returns, left = rows["return_to_go"], rows["remaining"]
+            return WindowedRule(returns, left, self.horizon, self.min_offset, self.tolerance, ahead)
         values, remaining = rows["return_to_go"], rows["remaining"]
         if self.goal_key is not None:
             limits = (self._experts(), self.horizon)

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from typing import Any, Literal, NamedTuple
 
 import torch
-from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
 
@@ -69,7 +68,7 @@ class PlainTargetModule(RetrievalTargetModule):
         super().__init__(database, in_keys=in_keys, out_keys=out_keys)
         self.rule = rule
 
-    def _make_rule(self, rows: TensorDictBase) -> TargetRule:
+    def _make_rule(self, rows: Any) -> TargetRule:
         return PlainRule(self.rule, rows["return_to_go"])
 
 

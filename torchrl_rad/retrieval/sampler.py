@@ -262,11 +262,7 @@ class RetrievalSampler(Sampler):
                 raise ValueError(f"dims are {self.dims}, but a state has {self._width} entries.")
             rows = self._prepare(states)
             if self.normalize:
-                rows = rows.double()
-                # a constant entry stays as it is; its deviation may differ from 0 by rounding
-                varies = rows.amax(0) > rows.amin(0)
-                deviation = torch.where(varies, rows.std(0, correction=0), 1.0)
-                self._scale = (rows.mean(0), deviation)
+                self._scale = self.fit_scale(rows)
                 rows = self._prepare(states)
             self._index = build_index(rows, self.metric, self.backend, self.k)
             self._revision = revision
@@ -275,6 +271,13 @@ class RetrievalSampler(Sampler):
             self._index = grow_index(self._index, rows, self.metric, self.backend, self.k)
             self._grown = False
         return self._index
+
+    def fit_scale(self, rows: Tensor) -> tuple[Tensor, Tensor]:
+        """Mean and deviation, float64 [D], that rows [N, D] are standardised by."""
+        rows = rows.double()
+        # a constant entry stays as it is; its deviation may differ from 0 by rounding
+        varies = rows.amax(0) > rows.amin(0)
+        return rows.mean(0), torch.where(varies, rows.std(0, correction=0), 1.0)
 
     def subset(self, storage: Any, rows: Tensor) -> SearchIndex:
         """A search structure of some rows, int64 [M], of the storage as it is now."""
