@@ -252,7 +252,10 @@ def save_policy(
 
 
 def load_policy(
-    folder: str | Path, database: ExpertDatabase | None = None, device: str | torch.device = "cpu"
+    folder: str | Path,
+    database: ExpertDatabase | None = None,
+    device: str | torch.device = "cpu",
+    memmap: bool = False,
 ) -> TensorDictSequential:
     """Loads a saved policy; with the same seed it acts as it did where it was saved.
 
@@ -261,6 +264,9 @@ def load_policy(
         database (ExpertDatabase, optional): used in place of the saved one, on purpose: other rows,
             other behaviour.
         device (str, optional): of the networks. Defaults to ``"cpu"``.
+        memmap (bool, optional): read the rows of the saved database from its files as they are
+            asked for, which processes of one machine share; it cannot grow then. Defaults to
+            ``False``.
 
     Raises:
         FileNotFoundError: the folder holds no policy.
@@ -281,7 +287,7 @@ def load_policy(
             f"reads {FORMAT}. Load it with the version that saved it."
         )
     if database is None and description["database"] is not None:
-        database = ExpertDatabase.loads(folder / "database")
+        database = ExpertDatabase.loads(folder / "database", memmap)
         if database.digest() != description["database"]:
             raise CheckpointError(
                 f"{folder / 'database'} is not the database that this policy was saved with "

@@ -24,6 +24,7 @@ from torchrl_rad.experiment.data import (
     resolve_dataset,
     window_sampler,
 )
+from torchrl_rad.experiment.driving import collector_settings
 from torchrl_rad.experiment.policies import (
     BACKBONE,
     PolicyParts,
@@ -178,6 +179,7 @@ def _whole_run(
     """From the data to the table."""
     if cfg["device"].startswith("cuda") and not torch.cuda.is_available():
         raise ValueError(f"device is {cfg['device']!r}, but torch sees no GPU; use device=cpu.")
+    collector_settings(cfg.get("collector"))  # refused now, not after the training
     torch.set_num_threads(cfg["threads"])
     torch.manual_seed(cfg["seed"])  # fresh weights are the same when resumed
     if cfg["loss"]["value"] not in ("recorded", "iql"):
