@@ -22,7 +22,7 @@ def ray():
     module = pytest.importorskip("ray", reason='needs ray: pip install "torchrl_rad[ray]"')
     with mock.patch.dict(os.environ, RAY_worker_niceness="0"):
         module.init(
-            num_cpus=2,
+            num_cpus=3,  # in Ray's books
             include_dashboard=False,
             log_to_driver=False,
             logging_level="ERROR",

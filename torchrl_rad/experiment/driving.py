@@ -50,8 +50,8 @@ def collector_settings(settings: Mapping[str, Any] | None) -> dict[str, Any]:
         chosen["rows"] = UNIT_ROWS if chosen["rows"] is None else chosen["rows"]
     elif chosen["workers"] != 1:
         raise ValueError(
-            f"collector.workers is {chosen['workers']}, but collector.backend=direct is this process "
-            "alone; use collector.backend=ray."
+            f"collector.workers is {chosen['workers']}, but collector.backend=direct is one process; "
+            "use collector.backend=ray."
         )
     for name in ("workers", "rows"):
         if chosen[name] is not None and chosen[name] < 1:
