@@ -19,8 +19,6 @@ from torchrl_rad.experiment import (
     PolicyFactory,
     RayEpisodes,
     TaskRows,
-    collect_episodes,
-    join_units,
     split_units,
 )
 
@@ -49,16 +47,14 @@ def two(ray, folder):
 
 def here(source, units, steps=STEPS):
     """The episodes of units, driven by this process."""
-    held, policy = TASK.open(), source()
-    parts = [
-        collect_episodes(held(unit), policy, steps, unit.seed, progress=False) for unit in units
-    ]
+    held = TASK.open()
+    episodes = held.drive(units, source(), steps, progress=False)
     held.close()
-    return join_units(parts)
+    return episodes
 
 
 def there(workers, source, units, steps=STEPS):
-    return join_units(workers.drive(units, source, steps, progress=False))
+    return workers.drive(units, source, steps, progress=False)
 
 
 def alive(ray):

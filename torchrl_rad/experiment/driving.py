@@ -2,20 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 
 from torchrl_rad.envs.task import Task
-from torchrl_rad.experiment.episodes import (
-    HeldRows,
-    collect_episodes,
-    join_units,
-    load_starts,
-    split_units,
-)
+from torchrl_rad.experiment.episodes import HeldRows, Unit, load_starts, split_units
 from torchrl_rad.experiment.factory import PolicyFactory, TaskRows
 from torchrl_rad.experiment.ray_episodes import RayEpisodes, require_ray
 from torchrl_rad.modules.replanning import with_replanning
@@ -50,7 +44,7 @@ def collector_settings(settings: Mapping[str, Any] | None) -> dict[str, Any]:
         chosen["rows"] = UNIT_ROWS if chosen["rows"] is None else chosen["rows"]
     elif chosen["workers"] != 1:
         raise ValueError(
-            f"collector.workers is {chosen['workers']}, but collector.backend=direct is one process; "
+            f"collector.workers is {chosen['workers']}, but backend=direct is one process; "
             "use collector.backend=ray."
         )
     for name in ("workers", "rows"):
@@ -82,32 +76,25 @@ class Driver:
         settings = self.cfg["evaluation"]
         seed = settings["seed"] + self.cfg["seed"]
         units = split_units(settings["episodes"], self.collector["rows"], seed)
-        drive = self._on_ray if self.collector["backend"] == "ray" else self._here
-        return join_units(drive(name, policy, units, settings.get("replan", 1)))
-
-    def _here(self, name, policy, units, replan) -> list[TensorDictBase]:
-        cfg = self.cfg
-        dtype = planning_dtype(cfg["optim"]["precision"], cfg["device"])
+        replan = settings.get("replan", 1)
+        options = {"name": name, "progress": self.cfg["logger"]["progress"]}
+        if self.collector["backend"] == "ray":
+            return self._on_ray(units, name, replan, options)
         if self._held is None:
-            self._held = HeldRows(self.task, load_starts(cfg["evaluation"]["starts"]))
+            self._held = HeldRows(self.task, load_starts(settings["starts"]))
         acting: TensorDictModuleBase = policy if replan == 1 else with_replanning(policy, replan)
-        options = {"dtype": dtype, "progress": cfg["logger"]["progress"]}
-        return [
-            collect_episodes(
-                self._held(unit), acting, self.task.max_steps, unit.seed, name, **options
-            )
-            for unit in units
-        ]
+        dtype = planning_dtype(self.cfg["optim"]["precision"], self.cfg["device"])
+        return self._held.drive(units, acting, self.task.max_steps, dtype=dtype, **options)
 
-    def _on_ray(self, name, policy, units, replan) -> list[TensorDictBase]:
-        cfg = self.cfg
-        dtype = planning_dtype(cfg["optim"]["precision"])  # workers act on CPUs
+    def _on_ray(
+        self, units: Sequence[Unit], name: str, replan: int, options: dict[str, Any]
+    ) -> TensorDictBase:
         source = PolicyFactory(str(self.run.path / "policies" / name), replan=replan)
         if self._workers is None:
-            rows = TaskRows(cfg["env"], cfg["evaluation"]["starts"])
+            rows = TaskRows(self.cfg["env"], self.cfg["evaluation"]["starts"])
             self._workers = RayEpisodes(rows, source, self.collector["workers"], units[0].rows)
-        progress = cfg["logger"]["progress"]
-        return self._workers.drive(units, source, self.task.max_steps, name, dtype, progress)
+        dtype = planning_dtype(self.cfg["optim"]["precision"])  # workers act on CPUs
+        return self._workers.drive(units, source, self.task.max_steps, dtype=dtype, **options)
 
     def close(self) -> None:
         """Ends environments and workers."""

@@ -148,6 +148,8 @@ def join_units(parts: Sequence[TensorDictBase]) -> TensorDictBase:
         >>> join_units(parts).shape
         torch.Size([2, 3])
     """
+    if len(parts) == 1:
+        return parts[0]
     longest = max(part.shape[1] for part in parts)
     padded = []
     for part in parts:
@@ -158,7 +160,9 @@ def join_units(parts: Sequence[TensorDictBase]) -> TensorDictBase:
 
 
 class HeldRows:
-    """The environment of a unit, kept for the next one: a row takes half a second to make.
+    """Drives units of episodes in this process.
+
+    The environment is kept for the next unit: a row takes up to half a second to make.
 
     Args:
         task (Task): what it is of.
@@ -178,6 +182,28 @@ class HeldRows:
             self._env = self.task.make_env(unit.rows, starts=self.starts, first=first)
             self._key = unit.rows, first
         return self._env
+
+    def drive(
+        self,
+        units: Sequence[Unit],
+        policy: TensorDictModuleBase,
+        max_steps: int,
+        name: str = "policy",
+        dtype: torch.dtype | None = None,
+        progress: bool = True,
+    ) -> TensorDictBase:
+        """The episodes [n, T] of all units, in their order.
+
+        Args:
+            units (sequence of Unit): of :func:`split_units`.
+            policy, max_steps, name, dtype, progress: as of :func:`collect_episodes`.
+        """
+        return join_units(
+            [
+                collect_episodes(self(unit), policy, max_steps, unit.seed, name, dtype, progress)
+                for unit in units
+            ]
+        )
 
     def close(self) -> None:
         """Closes it; the number of threads, which TorchRL then raises, stays as it was."""

@@ -22,7 +22,7 @@ from torchrl.collectors.distributed import RayCollector
 from tqdm import tqdm
 
 from torchrl_rad._files import CheckpointError
-from torchrl_rad.experiment.episodes import Unit, collect_episodes
+from torchrl_rad.experiment.episodes import Unit, collect_episodes, join_units
 from torchrl_rad.experiment.factory import PolicyFactory, TaskRows
 
 __all__ = ["EpisodeCollector", "RayEpisodes", "require_ray"]
@@ -159,8 +159,8 @@ class RayEpisodes:
         name: str = "policy",
         dtype: torch.dtype | None = None,
         progress: bool = True,
-    ) -> list[TensorDictBase]:
-        """The episodes of each unit, in the units' order.
+    ) -> TensorDictBase:
+        """The episodes [n, T] of all units, in their order.
 
         Each unit gives one result, however many workers die; without a death each is driven once.
 
@@ -192,7 +192,7 @@ class RayEpisodes:
             raise error.cause from error
         except ray.exceptions.RayActorError as error:
             raise _refusal(error) from error
-        return [found[unit.number] for unit in units]
+        return join_units([found[unit.number] for unit in units])
 
     def close(self) -> None:
         """Ends the workers, and Ray if it was started here."""
