@@ -100,7 +100,7 @@ def test_killed_workers(ray, two, folder):
     assert (episodes == expected).all()
 
 
-def test_a_database_that_grows(two, folder, tmp_path):
+def test_a_database_that_grows(ray, two, folder, tmp_path):
     database = ExpertDatabase.loads(folder / "database")
     first, units = tmp_path / "database", split_units(4, ROWS, SEED)
     database.dumps(first)
@@ -116,6 +116,9 @@ def test_a_database_that_grows(two, folder, tmp_path):
     assert (grown == here(after, units)).all()
     sources = grown["target_source"][..., 0]
     assert set(sources.unique().tolist()) <= {-1, only}
+    # a worker that starts anew reads what is there now
+    os.kill(alive(ray)[0], signal.SIGKILL)
+    assert (there(two, after, units) == grown).all()
     with pytest.raises(CheckpointError, match="sees another content of .* its stamp is"):
         two.drive(units, before, STEPS, progress=False)
 

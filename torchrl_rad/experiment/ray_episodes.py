@@ -12,6 +12,7 @@ from __future__ import annotations
 import logging
 import warnings
 from collections.abc import Sequence
+from dataclasses import replace
 from types import ModuleType
 from typing import Any
 
@@ -114,7 +115,7 @@ class RayEpisodes:
 
     Args:
         rows (TaskRows): what is driven in.
-        source (PolicyFactory): the policy that workers load at first.
+        source (PolicyFactory): whose policy, with its own database, workers load at first.
         workers (int): number of processes, each of one CPU.
         unit_rows (int): rows of a unit, to make their environments at the start.
 
@@ -133,6 +134,8 @@ class RayEpisodes:
             ray.init(include_dashboard=False, log_to_driver=False, logging_level=logging.ERROR)
         try:
             _require_cpus(ray, workers)
+            # a worker that starts anew begins with this too, when a growing database has grown
+            source = replace(source, database=None, stamp=None)
             with warnings.catch_warnings():
                 warnings.filterwarnings("ignore", "The policy is not an nn.Module")
                 self.collector = RayCollector(
