@@ -8,9 +8,12 @@ import pickle
 import signal
 import threading
 import time
+from functools import partial
 
 import pytest
 import torch
+from torchrl.collectors.distributed import RayCollector
+from torchrl.data import LazyTensorStorage
 
 from torchrl_rad import ExpertDatabase
 from torchrl_rad.checkpoint import CheckpointError
@@ -148,6 +151,24 @@ def test_more_workers_than_cpus(ray, folder):
         RayEpisodes(TASK, source, workers=4, unit_rows=ROWS)
     with pytest.raises(ValueError, match="collector.workers is 0"):
         RayEpisodes(TASK, source, workers=0, unit_rows=ROWS)
+
+
+@pytest.mark.filterwarnings("ignore::UserWarning")
+def test_torchrl_s_own_collector_fills_a_database(ray, folder):
+    collector = RayCollector(
+        [partial(TASK.task().make_env, 1)],
+        policy_factory=[PolicyFactory(str(folder))],
+        collector_kwargs={"trust_policy": True, "traj_format": "cat"},
+        trajs_per_batch=1,
+        frames_per_batch=300,
+        total_frames=300,
+        remote_configs={"num_cpus": 1},
+        weight_sync_schemes={},
+    )
+    database = ExpertDatabase(LazyTensorStorage(1000))
+    (steps,) = collector
+    database.extend(steps)
+    assert len(database) == 300 and database[:]["target"].shape == (300, 4)
 
 
 def test_what_is_sent_is_small(ray, folder):
