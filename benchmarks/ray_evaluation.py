@@ -155,17 +155,21 @@ def simulate(workers: int, units: int, unit_s: float, start_s: float, serial_s: 
 
 def table(columns: list[str], lines: list[list[Any]]) -> str:
     """Markdown."""
-    rows = ["| " + " | ".join(map(str, line)) + " |" for line in lines]
-    return "\n".join(["| " + " | ".join(columns) + " |", "|---" * len(columns) + "|", *rows])
+    rule = "|---" * len(columns) + "|"
+    return "\n".join([table_line(columns), rule, *(table_line(one) for one in lines)])
 
 
-def line(name: str, run: dict[str, Any], expected: list[float], seconds: float | None) -> list[Any]:
+def table_line(cells: list[Any]) -> str:
+    """Of such a table."""
+    return "| " + " | ".join(map(str, cells)) + " |"
+
+
+def line(name: str, run: dict[str, Any], expected: list[float], seconds: float) -> list[Any]:
     """Of the table of runs."""
     count, took = len(run["returns"]), run["drive_s"]
     same = sum(a == b for a, b in zip(run["returns"], expected, strict=True))
-    ratio = "-" if seconds is None else f"{seconds / took:.2f}"
     rate, start = f"{count / took:.2f}", f"{run['start_s']:.1f}"
-    return [name, start, f"{took:.1f}", rate, ratio, count, f"{same} of {count}"]
+    return [name, start, f"{took:.1f}", rate, f"{seconds / took:.2f}", count, f"{same} of {count}"]
 
 
 def print_simulation(run: dict[str, Any], arguments: argparse.Namespace, serial_s: float) -> None:
@@ -204,18 +208,24 @@ def measure(arguments: argparse.Namespace, task) -> None:
     env = TaskRows(json.loads((folder / "policy.json").read_text())["env"])
     source, steps = PolicyFactory(str(folder)), arguments.max_steps or task.max_steps
     units = split_units(arguments.episodes, arguments.rows, arguments.seed)
-    runs = {"this process": alone(task, source, units, steps)}
-    expected, seconds = runs["this process"]["returns"], runs["this process"]["drive_s"]
-    for workers in arguments.workers:
-        runs[f"ray, workers: {workers}"] = on_ray(env, source, units, steps, workers)
-    if arguments.kills:
-        run = on_ray(env, source, units, steps, max(arguments.workers), arguments.kills)
-        runs[f"the same, {run['killed']} of them killed"] = run
     print(f"{task.name}, {arguments.episodes} episodes of {steps} steps in units of "
           f"{arguments.rows}, 1 thread a process, {os.cpu_count()} cores, load "
-          f"{os.getloadavg()[1]:.1f}\n")  # fmt: skip
+          f"{os.getloadavg()[1]:.1f} at the start\n")  # fmt: skip
     columns = ["who", "start s", "drive s", "episodes/s", "times as fast", "results", "same return"]
-    print(table(columns, [line(name, run, expected, seconds) for name, run in runs.items()]))
+    print(table(columns, []))
+    runs: dict[str, dict[str, Any]] = {}
+
+    def note(name: str, run: dict[str, Any]) -> None:
+        runs[name] = run
+        expected, seconds = (runs["this process"][key] for key in ("returns", "drive_s"))
+        print(table_line(line(name, run, expected, seconds)), flush=True)
+
+    note("this process", alone(task, source, units, steps))
+    for workers in arguments.workers:
+        note(f"ray, workers: {workers}", on_ray(env, source, units, steps, workers))
+    if arguments.kills:
+        run = on_ray(env, source, units, steps, max(arguments.workers), arguments.kills)
+        note(f"the same, {run['killed']} of them killed", run)
     first = runs[f"ray, workers: {arguments.workers[0]}"]
     sent = {
         **sent_bytes(env, source, units, steps),
