@@ -8,6 +8,7 @@ The last table is a simulation, from the costs that one worker was measured to h
 from __future__ import annotations
 
 import argparse
+import hashlib
 import heapq
 import json
 import logging
@@ -26,7 +27,6 @@ import torch
 from torchrl._utils import logger as torchrl_logger
 
 from torchrl_rad.checkpoint import CheckpointError
-from torchrl_rad.evaluation import episode_results
 from torchrl_rad.experiment import (
     HeldRows,
     PolicyFactory,
@@ -55,9 +55,13 @@ def parse() -> argparse.Namespace:
     return parser.parse_args()
 
 
-def returns(steps) -> list[float]:
-    """Of each episode."""
-    return episode_results(steps)["return"].tolist()
+def fingerprints(steps) -> list[str]:
+    """Of each episode sha256 of all its states, actions and rewards."""
+    keys = ("observation", "action", ("next", "observation"), ("next", "reward"))
+    return [
+        hashlib.sha256(b"".join(row[key].numpy().tobytes() for key in keys)).hexdigest()
+        for row in steps.contiguous().unbind(0)
+    ]
 
 
 def alone(task, source: PolicyFactory, units, steps: int) -> dict[str, Any]:
@@ -69,7 +73,7 @@ def alone(task, source: PolicyFactory, units, steps: int) -> dict[str, Any]:
         ready = time.perf_counter()
         episodes = held.drive(units, policy, steps, progress=False)
         end = time.perf_counter()
-    return {"start_s": ready - begin, "drive_s": end - ready, "returns": returns(episodes)}
+    return {"start_s": ready - begin, "drive_s": end - ready, "episodes": fingerprints(episodes)}
 
 
 def on_ray(env: TaskRows, source: PolicyFactory, units, steps: int, workers: int, kills: int = 0):
@@ -85,7 +89,7 @@ def on_ray(env: TaskRows, source: PolicyFactory, units, steps: int, workers: int
         stop.set()
         killer.join()
         serial = serial_seconds(episodes.collector.remote_collectors[0], found, units)
-    figures = {"start_s": ready - begin, "drive_s": end - ready, "returns": returns(found)}
+    figures = {"start_s": ready - begin, "drive_s": end - ready, "episodes": fingerprints(found)}
     answer = {"answer_bytes": answer_bytes(found, units), "serial_s": serial}
     return {**figures, "killed": len(killed), **answer}
 
@@ -164,10 +168,10 @@ def table_line(cells: list[Any]) -> str:
     return "| " + " | ".join(map(str, cells)) + " |"
 
 
-def line(name: str, run: dict[str, Any], expected: list[float], seconds: float) -> list[Any]:
+def line(name: str, run: dict[str, Any], expected: list[str], seconds: float) -> list[Any]:
     """Of the table of runs."""
-    count, took = len(run["returns"]), run["drive_s"]
-    same = sum(a == b for a, b in zip(run["returns"], expected, strict=True))
+    count, took = len(run["episodes"]), run["drive_s"]
+    same = sum(a == b for a, b in zip(run["episodes"], expected, strict=True))
     rate, start = f"{count / took:.2f}", f"{run['start_s']:.1f}"
     return [name, start, f"{took:.1f}", rate, f"{seconds / took:.2f}", count, f"{same} of {count}"]
 
@@ -211,13 +215,13 @@ def measure(arguments: argparse.Namespace, task) -> None:
     print(f"{task.name}, {arguments.episodes} episodes of {steps} steps in units of "
           f"{arguments.rows}, 1 thread a process, {os.cpu_count()} cores, load "
           f"{os.getloadavg()[1]:.1f} at the start\n")  # fmt: skip
-    columns = ["who", "start s", "drive s", "episodes/s", "times as fast", "results", "same return"]
+    columns = ["who", "start s", "drive s", "episodes/s", "times as fast", "results", "the same"]
     print(table(columns, []))
     runs: dict[str, dict[str, Any]] = {}
 
     def note(name: str, run: dict[str, Any]) -> None:
         runs[name] = run
-        expected, seconds = (runs["this process"][key] for key in ("returns", "drive_s"))
+        expected, seconds = (runs["this process"][key] for key in ("episodes", "drive_s"))
         print(table_line(line(name, run, expected, seconds)), flush=True)
 
     note("this process", alone(task, source, units, steps))
