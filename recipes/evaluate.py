@@ -1,6 +1,7 @@
 """Scores a saved policy on its task, or on the way to other goals, for which nothing is trained.
 
 python recipes/evaluate.py outputs/pointmaze-umaze/<run>/policies/followed --episodes 100
+python recipes/evaluate.py outputs/pointmaze-umaze/<run>/policies/followed --backend ray --workers 4
 python recipes/evaluate.py outputs/pointmaze-umaze/<run>/policies/followed --goals 3,1 1,3 3,3
 """
 
@@ -9,24 +10,32 @@ from __future__ import annotations
 import argparse
 import logging
 import sys
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
 import torch
+from tensordict import TensorDictBase
 from tensordict.nn import TensorDictSequential
 from torchrl._utils import logger as torchrl_logger
 
 from torchrl_rad import ExpertDatabase, make_maze_env, with_goals
-from torchrl_rad.checkpoint import CheckpointError
+from torchrl_rad.checkpoint import CheckpointError, read_json
 from torchrl_rad.envs.maze import maze_cell
 from torchrl_rad.evaluation import episode_results
 from torchrl_rad.experiment import (
+    HeldRows,
+    PolicyFactory,
+    RayEpisodes,
+    TaskRows,
     collect_episodes,
+    collector_settings,
     make_data,
     make_database,
     policy_row,
     saved_maze,
     saved_task,
+    split_units,
 )
 from torchrl_rad.plots import plot_followed
 from torchrl_rad.policy import load_policy
@@ -60,6 +69,13 @@ def parse() -> argparse.Namespace:
         "--database", help="folder of the demonstrations; with --goals all steps that the run "
         "recorded are searched by default"
     )  # fmt: skip
+    parser.add_argument("--backend", default="direct", choices=("direct", "ray"), help="who drives")
+    parser.add_argument("--workers", type=int, default=1, help="processes of --backend ray")
+    parser.add_argument(
+        "--rows",
+        type=int,
+        help="episodes of a unit of work; same rows, same results on any backend",
+    )
     parser.add_argument("--csv", help="file for what was followed at each step")
     parser.add_argument("--picture", help="png of the longest way to the first goal")
     return parser.parse_args()
@@ -87,12 +103,32 @@ def load(arguments: argparse.Namespace) -> TensorDictSequential:
     return with_goals(policy, database)
 
 
+def drive(arguments: argparse.Namespace, policy, task, collector) -> TensorDictBase:
+    """The episodes of the task's own goal, by this process or by workers of Ray."""
+    units = split_units(arguments.episodes, collector["rows"], arguments.seed)
+    acting, rows = policy, HeldRows(task)
+    if collector["backend"] == "ray":
+        acting = PolicyFactory(*map(absolute, (arguments.folder, arguments.database)))
+        env = TaskRows(read_json(Path(arguments.folder) / "policy.json")["env"])
+        rows = RayEpisodes(env, acting, collector["workers"], units[0].rows)
+    with closing(rows):
+        dtype = planning_dtype(arguments.precision)
+        return rows.drive(units, acting, task.max_steps, task.name, dtype)
+
+
+def absolute(path: str | None) -> str | None:
+    """A path as workers, which are in other folders, see it."""
+    return None if path is None else str(Path(path).absolute())
+
+
 def main() -> None:
     """Reads the command line; errors that a user can mend end in one line."""
     arguments = parse()
     torch.set_num_threads(arguments.threads)
     goals, count = arguments.goals or [None], arguments.episodes
     try:
+        settings = {name: getattr(arguments, name) for name in ("backend", "workers", "rows")}
+        collector = collector_settings(settings)
         policy = load(arguments)
         needs_maze = arguments.goals or arguments.picture
         task = (saved_maze if needs_maze else saved_task)(arguments.folder)
@@ -101,14 +137,17 @@ def main() -> None:
         if len(policy) == 1 and (arguments.csv or arguments.picture):
             raise ValueError(f"the policy in {arguments.folder} retrieves nothing to write down.")
         if arguments.goals:
+            if collector["backend"] == "ray" or collector["rows"] is not None:
+                raise ValueError("--goals are driven by one process, all at once: leave --backend "
+                                 "and --rows out.")  # fmt: skip
             cells = [goal for goal in goals for _ in range(count)]
             env = make_maze_env(task, len(cells), goal_cell=cells, show_goal=True)
+            dtype = planning_dtype(arguments.precision)
+            steps = collect_episodes(env, policy, task.max_steps, arguments.seed, task.name, dtype)
         else:
-            env = task.make_env(count)
-    except (CheckpointError, FileNotFoundError, KeyError, ValueError) as error:
+            steps = drive(arguments, policy, task, collector)
+    except (CheckpointError, FileNotFoundError, ImportError, KeyError, ValueError) as error:
         sys.exit(f"error: {error.args[0] if isinstance(error, KeyError) else error}")
-    dtype = planning_dtype(arguments.precision)
-    steps = collect_episodes(env, policy, task.max_steps, arguments.seed, task.name, dtype)
     names = [task.name if goal is None else f"{task.name} {goal}" for goal in goals]
     parts = dict(zip(names, steps.split(count), strict=True))
     print(format_table({name: policy_row(task, policy, part) for name, part in parts.items()}))

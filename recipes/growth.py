@@ -2,6 +2,7 @@
 
 python recipes/growth.py outputs/pointmaze-medium/<run>/policies/followed --start 3 --rounds 20
 python recipes/growth.py outputs/pointmaze-medium/<run>/policies/followed --start 1 3 10 --rounds 1
+python recipes/growth.py outputs/pointmaze-medium/<run>/policies/followed --backend ray --workers 2
 """
 
 from __future__ import annotations
@@ -9,6 +10,7 @@ from __future__ import annotations
 import argparse
 import logging
 import sys
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -18,13 +20,23 @@ from tensordict.nn import TensorDictSequential
 from torchrl._utils import logger as torchrl_logger
 from torchrl.data import LazyTensorStorage
 
-from torchrl_rad import ExpertDatabase, RetrievalSampler, make_maze_env, reaches_goal
+from torchrl_rad import ExpertDatabase, RetrievalSampler, reaches_goal
 from torchrl_rad._files import staged_folder
 from torchrl_rad.checkpoint import CheckpointError, read_json, write_json
 from torchrl_rad.data import episode_lengths
 from torchrl_rad.data.experts import select_episodes
+from torchrl_rad.data.saved import database_stamp
 from torchrl_rad.evaluation import episode_results, interval
-from torchrl_rad.experiment import collect_episodes, make_data, saved_maze
+from torchrl_rad.experiment import (
+    HeldRows,
+    PolicyFactory,
+    RayEpisodes,
+    TaskRows,
+    collector_settings,
+    make_data,
+    saved_maze,
+    split_units,
+)
 from torchrl_rad.plots import plot_growth
 from torchrl_rad.policy import load_policy
 from torchrl_rad.precision import planning_dtype
@@ -49,6 +61,11 @@ def parse() -> argparse.Namespace:
     )
     parser.add_argument("--rounds", type=int, default=20, help="1: nothing is added")
     parser.add_argument("--rows", type=int, default=10, help="episodes of a round")
+    parser.add_argument("--backend", default="direct", choices=("direct", "ray"), help="who drives")
+    parser.add_argument("--workers", type=int, default=1, help="processes of --backend ray")
+    parser.add_argument(
+        "--unit", type=int, help="rows of a unit of work; same units, same results on any backend"
+    )
     parser.add_argument("--capacity", type=int, default=200_000, help="rows; the worst give way")
     parser.add_argument(
         "--prune", action="store_true", help="a round more with the demonstrations of the last one"
@@ -89,15 +106,12 @@ def add(database: ExpertDatabase, steps: TensorDictBase) -> None:
         database.extend(steps[reached].select(*COLUMNS).reshape(-1))
 
 
-def drive(env, policy, task, seed: int) -> tuple[dict[str, Any], TensorDictBase]:
-    """One round: its figures and its episodes."""
-    held = len(policy[0].database[:]["episode"].unique())
-    name = f"{held} demonstrations"
-    steps = collect_episodes(env, policy, task.max_steps, seed, name, planning_dtype())
+def figures(task, steps: TensorDictBase, held: int) -> dict[str, Any]:
+    """Of the episodes of a round, driven with ``held`` demonstrations."""
     results = episode_results(steps)
     scores = task.normalised_score(results["return"])
     mean, half = interval(scores)
-    figures = {
+    return {
         "demonstrations": held,
         "scores": scores.tolist(),
         "score": mean,
@@ -106,28 +120,69 @@ def drive(env, policy, task, seed: int) -> tuple[dict[str, Any], TensorDictBase]
         "found": float(results["found"].mean()),
         "followed": [used["episode"] for used in demonstration_usage(steps)],
     }
-    return figures, steps
 
 
-def grow(arguments: argparse.Namespace, policy, task, folder: Path) -> list[dict[str, Any]]:
+class Rounds:
+    """Drives rounds of a policy whose database lies in a folder: here, or on Ray's workers.
+
+    Workers open the rows in the folder anew when these have changed.
+    """
+
+    def __init__(self, arguments: argparse.Namespace, task, collector: dict[str, Any]):
+        self.rows, self.task, self.unit = arguments.rows, task, collector["rows"]
+        self.policy = str(Path(arguments.folder).absolute()) if on_ray(collector) else None
+        self.workers, self.episodes = collector["workers"], None if self.policy else HeldRows(task)
+
+    def __call__(self, policy, folder: Path, seed: int, name: str) -> TensorDictBase:
+        """The episodes [rows, T] of a round."""
+        units, acting = split_units(self.rows, self.unit, seed), policy
+        if self.policy is not None:
+            database = folder.absolute() / "database"
+            acting = PolicyFactory(self.policy, str(database), database_stamp(database))
+        if self.episodes is None:
+            env = TaskRows(read_json(Path(self.policy) / "policy.json")["env"])
+            self.episodes = RayEpisodes(env, acting, self.workers, units[0].rows)
+        return self.episodes.drive(units, acting, self.task.max_steps, name, planning_dtype())
+
+    def close(self) -> None:
+        """Ends environments and workers."""
+        if self.episodes is not None:
+            self.episodes.close()
+
+
+def on_ray(collector: dict[str, Any]) -> bool:
+    """Whether Ray's workers drive."""
+    return collector["backend"] == "ray"
+
+
+def grow(
+    arguments: argparse.Namespace, policy, drive: Rounds, folder: Path
+) -> list[dict[str, Any]]:
     """Acts and adds, round by round; goes on after the rounds that the folder holds."""
     database, rounds = policy[0].database, read_rounds(folder)
-    env = make_maze_env(task, arguments.rows)
     for number in range(len(rounds), arguments.rounds + arguments.prune):
         pruned = number == arguments.rounds
         if pruned:
             database.keep(rounds[-1]["followed"])
             print("only those that were followed in the last round:", flush=True)
+        if pruned or not folder.exists():
+            save(folder, database, rounds)  # from where workers read it
         seed = 10_000 + arguments.seed + number  # other start states each time
-        figures, steps = drive(env, policy, task, seed)
-        rounds.append({"seen": number * arguments.rows, "pruned": pruned, **figures})
+        held = len(database[:]["episode"].unique())
+        steps = drive(policy, folder, seed, f"{held} demonstrations")
+        about = {"seen": number * arguments.rows, "pruned": pruned}
+        rounds.append({**about, **figures(drive.task, steps, held)})
         print(LINE.format(**rounds[-1]), flush=True)
         add(database, steps)
-        with staged_folder(folder, replace=True) as stage:  # both or none
-            database.dumps(stage / "database")
-            write_json(stage / "rounds.json", rounds)
-    env.close()
+        save(folder, database, rounds)
     return rounds
+
+
+def save(folder: Path, database: ExpertDatabase, rounds: list[dict[str, Any]]) -> None:
+    """Database and rounds, both or none."""
+    with staged_folder(folder, replace=True) as stage:
+        database.dumps(stage / "database")
+        write_json(stage / "rounds.json", rounds)
 
 
 def read_rounds(folder: Path) -> list[dict[str, Any]]:
@@ -135,12 +190,16 @@ def read_rounds(folder: Path) -> list[dict[str, Any]]:
     return read_json(folder / "rounds.json") if folder.exists() else []
 
 
-def prepare(arguments: argparse.Namespace, folder: Path) -> list[tuple[TensorDictSequential, Path]]:
+def prepare(
+    arguments: argparse.Namespace, folder: Path, unit: int | None
+) -> list[tuple[TensorDictSequential, Path]]:
     """For each size to begin with the policy, with its database, and where its rounds are kept."""
     if min(arguments.rows, arguments.rounds) < 1:
         raise ValueError("--rows and --rounds are at least 1.")
     out = Path(arguments.out)
     settings = {name: getattr(arguments, name) for name in ("rows", "capacity", "seed")}
+    if unit is not None:
+        settings["unit"] = unit
     out.mkdir(parents=True, exist_ok=True)
     about = out / "settings.json"
     if about.exists() and read_json(about) != settings:
@@ -168,15 +227,16 @@ def main() -> None:
     arguments = parse()
     torch.set_num_threads(arguments.threads)
     folder, out = Path(arguments.folder).absolute(), Path(arguments.out)
-    try:
-        task = saved_maze(folder)
-        prepared = prepare(arguments, folder)
-    except (CheckpointError, OSError, KeyError, ValueError) as error:
-        sys.exit(f"error: {error.args[0] if isinstance(error, KeyError) else error}")
+    settings = {"backend": arguments.backend, "workers": arguments.workers, "rows": arguments.unit}
     runs = {}
-    for count, (policy, kept) in zip(arguments.start, prepared, strict=True):
-        torch.set_num_threads(arguments.threads)  # closing mazes raises it
-        runs[count] = grow(arguments, policy, task, kept)
+    try:
+        collector = collector_settings(settings)
+        prepared = prepare(arguments, folder, collector["rows"])
+        with closing(Rounds(arguments, saved_maze(folder), collector)) as drive:
+            for count, (policy, kept) in zip(arguments.start, prepared, strict=True):
+                runs[count] = grow(arguments, policy, drive, kept)
+    except (CheckpointError, ImportError, OSError, KeyError, ValueError) as error:
+        sys.exit(f"error: {error.args[0] if isinstance(error, KeyError) else error}")
     write_json(out / "results.json", {"runs": runs, **vars(arguments), **environment_facts()})
     plot_growth(runs, out / "growth.png")
     print(f"\n{out / 'results.json'}, {out / 'growth.png'}")

@@ -264,7 +264,10 @@ def save_policy(
 
 
 def load_policy(
-    folder: str | Path, database: Database | None = None, device: str | torch.device = "cpu"
+    folder: str | Path,
+    database: Database | None = None,
+    device: str | torch.device = "cpu",
+    memmap: bool = False,
 ) -> TensorDictSequential:
     """Loads a saved policy; with the same seed it acts as it did where it was saved.
 
@@ -273,6 +276,9 @@ def load_policy(
         database (ExpertDatabase or ShardedExpertDatabase, optional): used in place of the saved
             one, on purpose: other rows, other behaviour.
         device (str, optional): of the networks. Defaults to ``"cpu"``.
+        memmap (bool, optional): read the rows of the saved database from its files as they are
+            asked for, which processes of one machine share; it cannot grow then. Defaults to
+            ``False``.
 
     Raises:
         FileNotFoundError: the folder holds no policy.
@@ -293,7 +299,7 @@ def load_policy(
             f"reads {FORMAT}. Load it with the version that saved it."
         )
     if database is None and description["database"] is not None:
-        database = load_database(folder / "database")
+        database = load_database(folder / "database", memmap)
         if database.digest() != description["database"]:
             raise CheckpointError(
                 f"{folder / 'database'} is not the database that this policy was saved with "

@@ -21,7 +21,7 @@ from torchrl_rad._files import CheckpointError, read_json, write_atomic, write_j
 from torchrl_rad._states import load_tensors, save_tensors
 from torchrl_rad.results import ERROR
 
-__all__ = ["MetricsLog", "RunFolder", "environment_facts"]
+__all__ = ["MetricsLog", "RunFolder", "environment_facts", "package_versions"]
 
 PACKAGES = ("torchrl_rad", "torch", "torchrl", "tensordict", "gymnasium", "gymnasium_robotics",
             "mujoco", "numpy", "scipy")  # fmt: skip
@@ -207,17 +207,27 @@ def environment_facts(command: Sequence[str] | None = None) -> dict[str, Any]:
         >>> sorted(environment_facts(["dl_rad.py"]))
         ['command', 'cpus', 'machine', 'python', 'threads', 'versions']
     """
-    versions = {}
-    for name in PACKAGES:
-        try:
-            versions[name] = version(name)
-        except PackageNotFoundError:
-            versions[name] = "not installed"
     return {
         "command": " ".join(["python", *(sys.argv if command is None else command)]),
         "python": platform.python_version(),
         "machine": platform.machine(),
         "cpus": os.cpu_count(),
         "threads": torch.get_num_threads(),
-        "versions": versions,
+        "versions": package_versions(),
     }
+
+
+def package_versions() -> dict[str, str]:
+    """Versions of the packages on which results depend, in this process.
+
+    Examples:
+        >>> package_versions()["torchrl_rad"]
+        '0.1.0'
+    """
+    versions = {}
+    for name in PACKAGES:
+        try:
+            versions[name] = version(name)
+        except PackageNotFoundError:
+            versions[name] = "not installed"
+    return versions

@@ -92,6 +92,14 @@ def test_same_seed_same_score(folder):
     )
 
 
+@pytest.mark.filterwarnings("ignore::FutureWarning")
+def test_same_on_ray(ray, folder, monkeypatch):
+    monkeypatch.chdir(folder.parent)
+    fixed = ("--episodes", "3", "--rows", "2")
+    here, there = (score(folder.name, *fixed, *options) for options in ([], ["--backend", "ray"]))
+    assert columns(here) == columns(there)
+
+
 def test_folder_in_any_place(folder, tmp_path):
     shutil.copytree(folder, tmp_path / "copy")
     lines = [score(path, "--episodes", "1") for path in (folder, tmp_path / "copy")]
@@ -153,6 +161,8 @@ def test_another_database(whole, folder):
         (["--goals", "9,9"], "cell (9, 9) of PointMaze_UMaze-v3 is a wall or outside the map"),
         (["--database", "nowhere"], "nowhere holds no database"),
         (["--episodes", "0"], "--episodes is 0; at least one is needed"),
+        (["--workers", "2"], "collector.workers is 2, but backend=direct is one process"),
+        (["--goals", "3,1", "--rows", "1"], "--goals are driven by one process, all at once"),
     ],
 )
 def test_settings_that_are_none(whole, options, message):

@@ -55,6 +55,18 @@ def test_goes_on_where_it_stopped(whole, tmp_path):
     assert code == 1 and "pass another --out" in err
 
 
+@pytest.mark.filterwarnings("ignore::FutureWarning")
+def test_workers_see_what_was_added(ray, whole, tmp_path):
+    policy = whole[0].path / "policies" / "followed"
+    fixed = ("--start", "1", "--rounds", "2", "--prune", "--unit", "2")
+    here, _ = grow(policy, tmp_path / "here", *fixed)
+    there, _ = grow(policy, tmp_path / "there", *fixed, "--backend", "ray", "--workers", "2")
+    assert there["runs"] == here["runs"]
+    first, last, _ = there["runs"]["1"]
+    added = last["demonstrations"] - first["demonstrations"]
+    assert added == sum(score > -17.28 for score in first["scores"])  # each that paid, once
+
+
 def test_sizes(whole, tmp_path):
     policy = whole[0].path / "policies" / "followed"
     results, _ = grow(policy, tmp_path / "sizes", "--start", "1", "2", "--rounds", "1")

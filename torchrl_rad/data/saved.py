@@ -9,11 +9,11 @@ from typing import Any, NoReturn
 
 from tensordict import TensorDictBase
 
-from torchrl_rad._files import CheckpointError, read_json, verify_manifest
+from torchrl_rad._files import MANIFEST, CheckpointError, read_json, verify_manifest
 from torchrl_rad.data.experts import expert_from_config
 from torchrl_rad.retrieval.sampler import RetrievalSampler
 
-__all__ = ["FORMAT", "build", "read_config", "replaceable", "require_space"]
+__all__ = ["FORMAT", "build", "database_stamp", "read_config", "replaceable", "require_space"]
 
 FORMAT = 1  # raise it when the content of the folder changes
 
@@ -77,6 +77,16 @@ def read_config(path: Path, sizes_only: bool) -> dict[str, Any]:
             f"{path} has format {config['format']}, this version reads {FORMAT}; fill it anew."
         )
     return config
+
+
+def database_stamp(path: str | Path) -> str:
+    """Which content a saved database has, told without reading its rows: sha256 of their sha256s.
+
+    Raises:
+        CheckpointError: the folder has no manifest, or a damaged one.
+    """
+    verify_manifest(path, ())
+    return read_json(Path(path) / MANIFEST)["digest"]
 
 
 def replaceable(path: Path) -> bool:

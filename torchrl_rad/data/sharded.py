@@ -402,12 +402,17 @@ def _release(database: ExpertDatabase) -> None:
     database.storage._attached_entities.clear()
 
 
-def load_database(path: str | Path) -> ExpertDatabase | ShardedExpertDatabase:
+def load_database(path: str | Path, memmap: bool = False) -> ExpertDatabase | ShardedExpertDatabase:
     """Opens a saved database of either kind.
+
+    Args:
+        path (path): its folder.
+        memmap (bool, optional): as of :meth:`ExpertDatabase.loads`; a sharded one always is.
+            Defaults to ``False``.
 
     Raises:
         FileNotFoundError: the folder holds none.
         CheckpointError: a file is missing, damaged or cut short.
     """
     sharded = (Path(path) / LIST).is_file()
-    return ShardedExpertDatabase(path) if sharded else ExpertDatabase.loads(path)
+    return ShardedExpertDatabase(path) if sharded else ExpertDatabase.loads(path, memmap)

@@ -58,6 +58,9 @@ class AntMazeTask(Task):
         cells = [self.reset_cell] if starts is None else list(starts)
         return FixedGoalAntMaze(self, cells[number % len(cells)])
 
+    def variants(self, starts: Sequence[tuple[int, int]] | None = None) -> int:
+        return 1 if starts is None else len(starts)
+
     def cells(self, cells: Sequence[tuple[int, int]]) -> tuple[Tensor, float]:
         env = FixedGoalAntMaze(self)
         env.close()

@@ -55,6 +55,9 @@ class MazeTask(Task):
     def make_row(self, number: int, starts: Sequence[tuple[int, int]] | None = None) -> gym.Env:
         return FixedGoalMaze(self, None, None if starts is None else starts[number % len(starts)])
 
+    def variants(self, starts: Sequence[tuple[int, int]] | None = None) -> int:
+        return 1 if starts is None else len(starts)
+
     def starts(self) -> Tensor:
         env = FixedGoalMaze(self)
         env.close()

@@ -87,7 +87,13 @@ class Task(ABC):
         returns = f"reference returns {low} and {high} of {self.reference}"
         return f"score: 100 x (return - min) / (max - min), {returns}"
 
-    def make_env(self, rows: int, seed: int = 0, starts: Any = None) -> TransformedEnv:
+    def variants(self, starts: Any = None) -> int:
+        """Kinds of rows, which they take in turn: row n is made as row n + variants."""
+        return 1
+
+    def make_env(
+        self, rows: int, seed: int = 0, starts: Any = None, first: int = 0
+    ) -> TransformedEnv:
         """A TorchRL environment with ``rows`` independent rows.
 
         Row by row, the start states depend on the seed alone.
@@ -96,13 +102,16 @@ class Task(ABC):
             rows (int): number of rows.
             seed (int, optional): of the start states. Defaults to ``0``.
             starts (optional): where episodes begin, as each task says. Defaults to its own starts.
+            first (int, optional): number of the first row, where these are some of more. Defaults
+                to ``0``.
 
         Raises:
             ValueError: ``rows`` is below 1.
         """
         if rows < 1:
             raise ValueError(f"rows is {rows}; an environment has at least one row.")
-        return batched([partial(self.make_row, number, starts) for number in range(rows)], seed)
+        numbers = range(first, first + rows)
+        return batched([partial(self.make_row, number, starts) for number in numbers], seed)
 
 
 def batched(makers: Sequence[Callable[[], gym.Env]], seed: int) -> TransformedEnv:

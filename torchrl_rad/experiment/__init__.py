@@ -9,6 +9,16 @@ from torchrl_rad.experiment.data import (
     task_dataset,
     window_sampler,
 )
+from torchrl_rad.experiment.driving import Driver, collector_settings
+from torchrl_rad.experiment.episodes import (
+    HeldRows,
+    Unit,
+    collect_episodes,
+    join_units,
+    load_starts,
+    split_units,
+)
+from torchrl_rad.experiment.factory import PolicyFactory, TaskRows
 from torchrl_rad.experiment.policies import (
     BACKBONE,
     PolicyParts,
@@ -20,6 +30,7 @@ from torchrl_rad.experiment.policies import (
     take_weights,
     trained_name,
 )
+from torchrl_rad.experiment.ray_episodes import EpisodeCollector, RayEpisodes
 from torchrl_rad.experiment.recipe import (
     MakeObjectives,
     denoising_objective,
@@ -32,23 +43,30 @@ from torchrl_rad.experiment.recipe import (
     train_policies,
 )
 from torchrl_rad.experiment.scoring import (
-    collect_episodes,
     evaluate_policies,
-    load_starts,
     policy_row,
     step_error,
 )
 
 __all__ = [
     "BACKBONE",
+    "Driver",
+    "EpisodeCollector",
+    "HeldRows",
     "MakeObjectives",
+    "PolicyFactory",
     "PolicyParts",
+    "RayEpisodes",
+    "TaskRows",
+    "Unit",
     "check_data",
     "collect_episodes",
+    "collector_settings",
     "denoising_objective",
     "head_options",
     "describe_windows",
     "evaluate_policies",
+    "join_units",
     "load_starts",
     "make_data",
     "make_database",
@@ -63,6 +81,7 @@ __all__ = [
     "saved_maze",
     "saved_task",
     "share_weights",
+    "split_units",
     "step_error",
     "step_objective",
     "take_weights",

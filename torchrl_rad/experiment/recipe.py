@@ -27,6 +27,7 @@ from torchrl_rad.experiment.data import (
     resolve_dataset,
     window_sampler,
 )
+from torchrl_rad.experiment.driving import collector_settings
 from torchrl_rad.experiment.policies import (
     BACKBONE,
     PolicyParts,
@@ -222,6 +223,7 @@ def _whole_run(
     run: RunFolder, cfg: dict[str, Any], make_objectives: MakeObjectives, resume: bool
 ) -> None:
     """From the data to the table."""
+    collector_settings(cfg.get("collector"))  # refused now, not after the training
     torch.set_num_threads(cfg["threads"])
     torch.manual_seed(cfg["seed"])  # fresh weights are the same when resumed
     if cfg["loss"]["value"] not in ("recorded", "iql"):

@@ -4,29 +4,24 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
+from contextlib import closing
 from typing import Any
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModuleBase, TensorDictSequential
-from torchrl.envs import EnvBase
-from tqdm import tqdm
+from tensordict.nn import TensorDictSequential
 
-from torchrl_rad.data.sources import find_dataset, load_dataset
 from torchrl_rad.envs.task import Task
-from torchrl_rad.evaluation import episode_results, evaluate, measure_latency, summarise
+from torchrl_rad.evaluation import episode_results, measure_latency, summarise
 from torchrl_rad.experiment.data import window_sampler
+from torchrl_rad.experiment.driving import Driver
 from torchrl_rad.experiment.policies import BACKBONE, PolicyParts
-from torchrl_rad.modules.replanning import with_replanning
 from torchrl_rad.objectives.step import draw_step_pairs
-from torchrl_rad.precision import planning_dtype
 from torchrl_rad.results import write_results
 from torchrl_rad.runs import RunFolder, environment_facts
 
 __all__ = [
-    "collect_episodes",
     "evaluate_policies",
-    "load_starts",
     "policy_row",
     "step_error",
 ]
@@ -38,65 +33,6 @@ PARTS = {  # what stands in their columns
     "DiffuserLitePlanner": "PL",
     "DiffuserPlanner": "PL",
 }
-
-
-def collect_episodes(
-    env: EnvBase,
-    policy: TensorDictModuleBase,
-    max_steps: int,
-    seed: int,
-    name: str = "policy",
-    dtype: torch.dtype | None = None,
-    progress: bool = True,
-) -> TensorDictBase:
-    """The first episode of each row of an environment; same seed, same episodes.
-
-    Args:
-        env (EnvBase): [n] rows, as of :meth:`~torchrl_rad.envs.Task.make_env`.
-        policy (TensorDictModuleBase): what acts.
-        max_steps (int): limit of an episode.
-        seed (int): of the start states and of the policy's noise.
-        name (str, optional): shown beside the progress bar.
-        dtype (torch.dtype, optional): of autocast, as of
-            :func:`~torchrl_rad.precision.planning_dtype`. Defaults to float32.
-        progress (bool, optional): show a bar. Defaults to ``True``.
-
-    Returns:
-        See :func:`~torchrl_rad.evaluation.evaluate`.
-    """
-    device = next(policy.parameters()).device
-
-    def act(tensordict: TensorDictBase) -> TensorDictBase:
-        with torch.autocast(device.type, dtype, dtype is not None):
-            return policy(tensordict.to(device)).to("cpu")  # where the simulator is
-
-    env.set_seed(seed)
-    torch.manual_seed(seed)
-    bar = tqdm(total=max_steps, desc=f"evaluating {name}", unit="step", disable=not progress)
-    with bar:
-        return evaluate(env, act, max_steps, progress=bar.update)
-
-
-def load_starts(settings: Mapping[str, Any] | None) -> Any:
-    """Where episodes begin, for :meth:`~torchrl_rad.envs.Task.make_env`; None: the task's own.
-
-    Args:
-        settings (mapping, optional): ``cells``, a list of (row, column); or ``states``, names of a
-            data set as of :func:`~torchrl_rad.data.find_dataset`, whose infos hold ``qpos`` and
-            ``qvel``.
-
-    Raises:
-        FileNotFoundError: the data set is not here.
-        ValueError: neither is given.
-    """
-    if settings is None:
-        return None
-    if settings.get("cells"):
-        return [tuple(cell) for cell in settings["cells"]]
-    if not settings.get("states"):
-        raise ValueError(f"evaluation.starts is {dict(settings)}; expected cells or states.")
-    names = find_dataset(settings["states"])
-    return load_dataset(names, infos=("qpos", "qvel"), progress=False)["info"]
 
 
 def evaluate_policies(
@@ -111,38 +47,27 @@ def evaluate_policies(
     Returns:
         Rows for :func:`~torchrl_rad.results.format_table`, and the episodes [n, T] of each policy.
     """
-    settings, progress = cfg["evaluation"], cfg["logger"]["progress"]
-    torch.manual_seed(settings["seed"])
+    seed = cfg["evaluation"]["seed"]
+    torch.manual_seed(seed)
     windows = window_sampler(data, cfg["network"]["horizon"], 4096)()
     rows: dict[str, dict[str, Any]] = {}
     episodes: dict[str, TensorDictBase] = {}
     seconds: dict[str, float] = {}
-    env = None  # a maze costs some 13 MB a row: one environment serves all policies
-    for name, parts in policies.items():
-        steps = run.load_episodes(name)
-        if steps is None:
-            seed = settings["seed"] + cfg["seed"]
-            if env is None:
-                env = task.make_env(settings["episodes"], starts=load_starts(settings["starts"]))
-            dtype = planning_dtype(cfg["optim"]["precision"], cfg["device"])
-            policy: TensorDictModuleBase = parts.policy
-            if settings.get("replan", 1) > 1:
-                policy = with_replanning(parts.policy, settings["replan"])
-            begin = time.perf_counter()
-            steps = collect_episodes(env, policy, task.max_steps, seed, name, dtype, progress)
-            seconds[name] = time.perf_counter() - begin
-            run.save_episodes(name, steps)
-        episodes[name] = steps
-        rows[name] = policy_row(task, parts.policy, steps)
-        rows[name]["rollout_s"] = seconds.get(name)  # of all episodes, side by side
-        if name != BACKBONE:
-            torch.manual_seed(settings["seed"])  # the same pairs for each policy, and when resumed
-            recorded = parts.policy[1].estimate == "recorded"
-            rows[name]["step_error"] = None if recorded else step_error(parts.policy, windows)
-    if env is not None:
-        threads = torch.get_num_threads()
-        env.close()  # TorchRL then raises the number of threads
-        torch.set_num_threads(threads)
+    with closing(Driver(run, cfg, task)) as drive:
+        for name, parts in policies.items():
+            steps = run.load_episodes(name)
+            if steps is None:
+                begin = time.perf_counter()
+                steps = drive(name, parts.policy)
+                seconds[name] = time.perf_counter() - begin
+                run.save_episodes(name, steps)
+            episodes[name] = steps
+            rows[name] = policy_row(task, parts.policy, steps)
+            rows[name]["rollout_s"] = seconds.get(name)  # of all episodes
+            if name != BACKBONE:
+                torch.manual_seed(seed)  # the same pairs for each policy, and when resumed
+                recorded = parts.policy[1].estimate == "recorded"
+                rows[name]["step_error"] = None if recorded else step_error(parts.policy, windows)
     about = {"task": cfg["env"]["name"], "seed": cfg["seed"], "data": cfg["replay_buffer"]}
     facts = {"score_source": task.score_source, **environment_facts()}
     write_results(run.path, {**about, "rows": rows, **facts})
