@@ -231,8 +231,9 @@ def main() -> None:
     runs = {}
     try:
         collector = collector_settings(settings)
+        task = saved_maze(folder)  # first: no policy is said before no run is
         prepared = prepare(arguments, folder, collector["rows"])
-        with closing(Rounds(arguments, saved_maze(folder), collector)) as drive:
+        with closing(Rounds(arguments, task, collector)) as drive:
             for count, (policy, kept) in zip(arguments.start, prepared, strict=True):
                 runs[count] = grow(arguments, policy, drive, kept)
     except (CheckpointError, ImportError, OSError, KeyError, ValueError) as error:
