@@ -87,8 +87,7 @@ def merge_results(folders: Sequence[str | Path]) -> dict[str, dict[str, Any]]:
     tasks = {run["task"] for run in runs}
     if len(tasks) != 1:
         raise CheckpointError(f"these runs are of several tasks, {sorted(tasks)}; merge each.")
-    names = [name for name in runs[0]["rows"] if all(name in run["rows"] for run in runs)]
-    return {name: _merge([run["rows"][name] for run in runs]) for name in names}
+    return _merge_runs(runs)
 
 
 def merge_sweep(folders: Sequence[str | Path]) -> tuple[dict[str, dict[str, Any]], dict[str, str]]:
@@ -106,18 +105,19 @@ def merge_sweep(folders: Sequence[str | Path]) -> tuple[dict[str, dict[str, Any]
     """
     if len(folders) == 0:
         raise CheckpointError("no run folders to merge; pass one or more.")
-    tasks: dict[str, list[Path]] = {}
+    tasks: dict[str, list[dict[str, Any]]] = {}
     failed = {}
     for folder in map(Path, folders):
         if (folder / "results.json").exists():
-            tasks.setdefault(_read(folder)["task"], []).append(folder)
+            run = _read(folder)
+            tasks.setdefault(run["task"], []).append(run)
         else:
             file = folder / ERROR
             why = file.read_text().strip() if file.exists() else "it is not over, or was killed"
             failed[str(folder)] = why
     rows = {}
     for task, of_task in tasks.items():
-        for name, row in merge_results(of_task).items():
+        for name, row in _merge_runs(of_task).items():
             rows[name if len(tasks) == 1 else f"{task} {name}"] = row
     return rows, failed
 
@@ -152,6 +152,12 @@ def _read(folder: Path) -> dict[str, Any]:
     if not isinstance(results, dict) or not {"task", "rows"} <= results.keys():
         raise CheckpointError(f"{folder / 'results.json'} is not of a run: no task or rows in it.")
     return results
+
+
+def _merge_runs(runs: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
+    """Rows of the policies that all of these runs of one task have."""
+    names = [name for name in runs[0]["rows"] if all(name in run["rows"] for run in runs)]
+    return {name: _merge([run["rows"][name] for run in runs]) for name in names}
 
 
 def _merge(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:

@@ -32,6 +32,7 @@ from torchrl_rad.data import shard_homes, sharded
 from torchrl_rad.modules.target_variants import PlainTargetModule
 
 from ..oracle import target_of
+from ..walks import episodes, random_walks
 
 NAMES = ["target", "found", "similarity", "target_return", "target_index", "target_offset",
          "target_source"]  # fmt: skip
@@ -45,20 +46,9 @@ rules = pytest.mark.parametrize("rule", RULES, ids=["highest", "tolerant", "offs
 SEARCH = {"metric": "euclidean", "k": 20, "threshold": 0.5}
 
 
-def steps_of(states, lengths, rewards):
-    """Flat steps of whole episodes: states [T, S]."""
-    done = torch.zeros(len(states), 1, dtype=torch.bool)
-    done[torch.tensor(lengths).cumsum(0) - 1] = True
-    end = TensorDict({"reward": rewards.reshape(-1, 1), "done": done}, [len(states)])
-    return TensorDict({"observation": states, "next": end}, [len(states)])
-
-
 def walks(count=12, length=10, width=3, seed=0):
     """Random walks with a reward now and then."""
-    generator = torch.Generator().manual_seed(seed)
-    states = torch.randn(count, length, width, generator=generator).cumsum(1) * 0.2
-    rewards = (torch.rand(count * length, generator=generator) > 0.8).float()
-    return steps_of(states.reshape(-1, width), [length] * count, rewards)
+    return random_walks(count, length, width, seed, unpaid=0.8)
 
 
 def queries(count=30, width=3):
@@ -108,7 +98,7 @@ def tables(draw):
     cells = st.lists(st.integers(-2, 2), min_size=rows * width, max_size=rows * width)
     states = torch.tensor(draw(cells), dtype=torch.float32).reshape(rows, width)
     rewards = draw(st.lists(st.integers(0, 2), min_size=rows, max_size=rows))
-    return steps_of(states, lengths, torch.tensor(rewards, dtype=torch.float32))
+    return episodes(states, lengths, torch.tensor(rewards, dtype=torch.float32))
 
 
 @settings(max_examples=25, deadline=None)
@@ -276,7 +266,7 @@ def test_shards_are_filled_and_closed(tmp_path):
 
 def test_expert_rule_and_ids(tmp_path):
     many = ShardedExpertDatabase.create(tmp_path / "many", expert=reaches_goal(), rows_per_shard=25)
-    steps = steps_of(torch.arange(9.0)[:, None], [3, 3, 3], torch.tensor([0, 0, 1.0] + [0] * 6))
+    steps = episodes(torch.arange(9.0)[:, None], [3, 3, 3], torch.tensor([0, 0, 1.0] + [0] * 6))
     steps["episode"] = torch.tensor([7] * 3 + [8] * 3 + [11] * 3)
     many.extend(steps)
     assert many[:]["episode"].tolist() == [7] * 3

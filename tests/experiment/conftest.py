@@ -5,7 +5,7 @@ from unittest import mock
 
 import pytest
 
-from .saved_policy import save_small_policy
+from ..saved_policy import save_small_policy
 
 
 @pytest.fixture(scope="session")

@@ -12,7 +12,7 @@ from torchrl_rad.experiment import Driver
 from torchrl_rad.policy import load_policy
 from torchrl_rad.runs import RunFolder
 
-from .saved_policy import ENV
+from ..saved_policy import ENV
 
 CONFIG = {
     "seed": 0,

@@ -17,7 +17,7 @@ from torchrl_rad.experiment import (
     split_units,
 )
 
-from .saved_policy import ENV
+from ..saved_policy import ENV
 
 TASK = make_task(ENV)
 

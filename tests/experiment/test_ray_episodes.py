@@ -25,7 +25,7 @@ from torchrl_rad.experiment import (
     split_units,
 )
 
-from .saved_policy import ENV
+from ..saved_policy import ENV
 
 pytestmark = pytest.mark.filterwarnings("ignore::FutureWarning")
 ROWS, STEPS, SEED = 2, 30, 7

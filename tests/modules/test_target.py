@@ -23,28 +23,16 @@ from torchrl_rad import (
 from torchrl_rad.modules import target
 
 from ..oracle import target_of
+from ..walks import episodes, random_walks
 
 NAMES = ["target", "found", "similarity", "target_return", "target_index", "target_offset"]
 RULES = [{"rule": "highest"}, {"rule": "highest", "tolerance": 0.3}, {"rule": "followed"}]
 rules = pytest.mark.parametrize("rule", RULES, ids=["highest", "tolerant", "followed"])
 
 
-def episodes(states, lengths, rewards=None):
-    """Flat steps of whole episodes: states [T, S]."""
-    states = torch.as_tensor(states)
-    done = torch.zeros(len(states), 1, dtype=torch.bool)
-    done[torch.tensor(lengths).cumsum(0) - 1] = True
-    reward = torch.zeros(len(states)) if rewards is None else torch.as_tensor(rewards)
-    following = TensorDict({"reward": reward.reshape(-1, 1), "done": done}, [len(states)])
-    return TensorDict({"observation": states, "next": following}, [len(states)])
-
-
 def walks(count=12, length=25, width=3, seed=0):
     """Random walks with a reward now and then."""
-    generator = torch.Generator().manual_seed(seed)
-    states = torch.randn(count, length, width, generator=generator).cumsum(1) * 0.2
-    rewards = (torch.rand(count * length, generator=generator) > 0.9).float()
-    return episodes(states.reshape(-1, width), [length] * count, rewards)
+    return random_walks(count, length, width, seed, unpaid=0.9)
 
 
 def database(data=None, storage=LazyTensorStorage, capacity=1000, gamma=0.9, **search):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Self
 
 import torch
 from tensordict import TensorDict
@@ -30,6 +30,17 @@ class AskedReplayBuffer(TensorDictReplayBuffer):
     def columns(self) -> Any:
         """The columns by their keys, for reading some rows: ``columns["step"][index]``."""
         return self[:]
+
+    def __copy__(self) -> Self:
+        return self
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> Self:
+        return self
+
+    def _sent_options(self) -> dict[str, Any]:
+        """What a pickle passes to the constructor beside a path."""
+        used = self._transform is not None and len(self._transform)
+        return {"batch_size": self._batch_size, "transform": self._transform if used else None}
 
     def _require_rows(self, purpose: str) -> None:
         if len(self) == 0:

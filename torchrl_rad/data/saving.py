@@ -140,17 +140,8 @@ class SavedReplayBuffer(AskedReplayBuffer):
         database.path, database._saved = path, storage_revision(database._storage)
         return database
 
-    def __copy__(self) -> Self:
-        return self
-
-    def __deepcopy__(self, memo: dict[int, Any]) -> Self:
-        return self
-
     def __reduce__(self) -> tuple:
-        transform = (
-            self._transform if self._transform is not None and len(self._transform) else None
-        )
-        kwargs = {"batch_size": self._batch_size, "transform": transform}
+        kwargs = self._sent_options()
         if len(self) == 0:
             return _empty, (type(self), self._config(), kwargs)
         current = self._saved == storage_revision(self._storage)

@@ -67,7 +67,9 @@ class ShardSampler(RetrievalSampler):
         if k == 0:
             rows = torch.full((len(query), 0), -1)
             return rows, torch.empty(len(query), 0, dtype=torch.float64)
-        self._check_width(storage, query)
+        width = storage.tables[0].get(self.key).shape[-1]
+        self._check_query(query, width)
+        self._check_dims(width)
         asked = query.detach().to("cpu", torch.float64).numpy()
         try:
             waits = [home.call("nearest", asked, k) for home in self._told_homes()]
@@ -83,16 +85,6 @@ class ShardSampler(RetrievalSampler):
             raise
         near, rows = merged(found, k)  # type: ignore[arg-type]
         return rows, near
-
-    def _check_width(self, storage: Any, query: Tensor) -> None:
-        width = storage.tables[0].get(self.key).shape[-1]
-        if query.shape[-1] != width:
-            raise ValueError(
-                f"the query has {query.shape[-1]} entries, a state of the database {width}; "
-                "pass states as wide as those it was filled with."
-            )
-        if self.dims is not None and max(self.dims) >= width:
-            raise ValueError(f"dims are {self.dims}, but a state has {width} entries.")
 
     def best(self, storage: Any, query: Tensor, rank: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         raise NotImplementedError("a sharded database ranks no rows beforehand.")

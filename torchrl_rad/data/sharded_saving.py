@@ -7,11 +7,11 @@ import hashlib
 import json
 import shutil
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
-from torchrl_rad._files import read_json, staged_folder
+from torchrl_rad._files import staged_folder
 from torchrl_rad.data.asking import AskedReplayBuffer
-from torchrl_rad.data.saved import require_space
+from torchrl_rad.data.saved import database_stamp, require_space
 from torchrl_rad.data.shards import ShardList
 
 __all__ = ["SavedShards"]
@@ -38,7 +38,7 @@ class SavedShards(AskedReplayBuffer):
         config = {name: self._list.config[name] for name in ("gamma", "expert", "sampler")}
         hashed = hashlib.sha256(json.dumps(config, sort_keys=True).encode())
         for path, shard in zip(self.shards, self._list.shards, strict=True):
-            hashed.update(f"{read_json(path / 'manifest.json')['digest']} {shard.shift}".encode())
+            hashed.update(f"{database_stamp(path)} {shard.shift}".encode())
         return hashed.hexdigest()
 
     def dumps(self, path: str | Path) -> None:
@@ -67,18 +67,9 @@ class SavedShards(AskedReplayBuffer):
                     named.append(dataclasses.replace(shard, path=name))
                 ShardList(self._list.config, tuple(named)).write(stage)
 
-    def __copy__(self) -> Self:
-        return self
-
-    def __deepcopy__(self, memo: dict[int, Any]) -> Self:
-        return self
-
     def __reduce__(self) -> tuple:
         self.flush()
-        transform = (
-            self._transform if self._transform is not None and len(self._transform) else None
-        )
-        kwargs = {"batch_size": self._batch_size, "transform": transform}
+        kwargs = self._sent_options()
         search = {"k": self._sampler.k, "threshold": self._sampler.threshold}
         return _reopen, (type(self), str(self.folder), kwargs, search)
 

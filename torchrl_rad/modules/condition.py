@@ -7,6 +7,8 @@ from typing import Self
 import torch
 from torch import Tensor, nn
 
+from torchrl_rad.modules.return_model import check_returns
+
 __all__ = ["ReturnCondition"]
 
 
@@ -50,8 +52,7 @@ class ReturnCondition(nn.Module):
         Raises:
             ValueError: there are none, or they hold NaN or Inf.
         """
-        if returns.numel() == 0 or not returns.isfinite().all():
-            raise ValueError(f"expected finite returns, got {returns.numel()} with NaN or Inf.")
+        check_returns(returns)
         ordered = returns.flatten().float().sort().values  # quantile() takes 16 million at most
         self.wanted.fill_(ordered[round(self.share * (len(ordered) - 1))])
         self.mean.fill_(ordered.double().mean())

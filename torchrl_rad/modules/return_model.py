@@ -12,6 +12,12 @@ from torchrl_rad.modules.normalizer import Normalizer
 __all__ = ["ReturnModel", "ReturnScale"]
 
 
+def check_returns(returns: Tensor) -> None:
+    """Raises ValueError where there are no returns, or NaN or Inf among them."""
+    if returns.numel() == 0 or not returns.isfinite().all():
+        raise ValueError(f"expected finite returns, got {returns.numel()} with NaN or Inf.")
+
+
 class ReturnScale(nn.Module):
     """What return models share: their normaliser, and the unit in which their networks predict.
 
@@ -40,8 +46,7 @@ class ReturnScale(nn.Module):
         Raises:
             ValueError: there are none, or they hold NaN or Inf.
         """
-        if returns.numel() == 0 or not returns.isfinite().all():
-            raise ValueError(f"expected finite returns, got {returns.numel()} with NaN or Inf.")
+        check_returns(returns)
         self.mean.fill_(float(returns.mean()))
         self.deviation.fill_(max(float(returns.std(correction=0)), 1e-6))
         return self

@@ -231,17 +231,26 @@ class RetrievalSampler(Sampler):
     def _ready(self, storage: Any, query: Tensor) -> tuple[SearchIndex, Tensor, Tensor | None]:
         """The search structure, queries as it wants them, and which are finite if not all are."""
         index = self.build(storage)
-        if query.shape[-1] != self._width:
-            raise ValueError(
-                f"the query has {query.shape[-1]} entries, a state of the database {self._width}; "
-                "pass states as wide as those it was filled with."
-            )
+        self._check_query(query, self._width)
         query = query.detach().to(index.rows.device, torch.float64)
         finite = query.isfinite().all(-1, keepdim=True)
         whole = bool(finite.all())
         if not whole:
             query = torch.where(finite, query, 0.0)
         return index, self._prepare(query), None if whole else finite
+
+    def _check_query(self, query: Tensor, width: int) -> None:
+        """Raises ValueError for a query of another width than the states."""
+        if query.shape[-1] != width:
+            raise ValueError(
+                f"the query has {query.shape[-1]} entries, a state of the database {width}; "
+                "pass states as wide as those it was filled with."
+            )
+
+    def _check_dims(self, width: int) -> None:
+        """Raises ValueError for dims that states of a width do not have."""
+        if self.dims is not None and max(self.dims) >= width:
+            raise ValueError(f"dims are {self.dims}, but a state has {width} entries.")
 
     def _prepare(self, states: Tensor) -> Tensor:
         if self.dims is not None:
@@ -258,8 +267,7 @@ class RetrievalSampler(Sampler):
             self.invalidate()
             states = storage[:].get(self.key)
             self._width = states.shape[-1]
-            if self.dims is not None and max(self.dims) >= self._width:
-                raise ValueError(f"dims are {self.dims}, but a state has {self._width} entries.")
+            self._check_dims(self._width)
             rows = self._prepare(states)
             if self.normalize:
                 self._scale = self.fit_scale(rows)
