@@ -133,15 +133,16 @@ class Objective:
         device = next(self.loss.parameters()).device.type
         with torch.autocast(device, torch.bfloat16, self.bf16):
             out = self.module(batch)
+        values = {key: value.detach() for key, value in out.items()}
         if not self.graphs:  # there it would wait for the GPU
-            self.check(out)
+            self.check(values)
         self.optimizer.zero_grad()
         sum(out[key] for key in out.keys() if key.startswith("loss_")).backward()
         clip_grad_norm_(self.loss.parameters(), CLIP)
         self.optimizer.step()
         if self.updater is not None:
             self.updater.step()
-        return TensorDict({key: value.detach() for key, value in out.items()})
+        return TensorDict(values)
 
     def components(self, name: str) -> dict[str, Any]:
         """What a checkpoint holds of it."""
@@ -268,13 +269,14 @@ def train(
     with bar, drawing_for(share), _stop_requests() as stop:
         for step in range(begin + 1, steps + 1):
             windows = share.of(sample())
+            device = windows.device or "cpu"
             meter.add(_update_all(objectives, windows, step))
-            stopped = wanted_by_any(stop.requested, windows.device or "cpu")
+            stopped = wanted_by_any(stop.requested, device)
             saves = step % save_interval == 0 or step == steps or stopped
             if saves or step % log_interval == 0:
-                _check(objectives, meter.means(), step)
+                _check_graphs(objectives, meter, step)
             if step % log_interval == 0 or step == steps:
-                means = mean_over_processes(meter.read(), windows.device or "cpu")
+                means = mean_over_processes(meter.read(), device)
                 if writes:
                     log(step, means)
                 bar.set_postfix_str(_short(means))
@@ -297,10 +299,12 @@ def _update_all(objectives, windows: TensorDictBase, step: int) -> dict[str, Ten
     return values
 
 
-def _check(objectives, means: Mapping[str, float], step: int) -> None:
-    """Raises FloatingPointError if a loss of the steps since the last log is not finite."""
+def _check_graphs(objectives, meter: Meter, step: int) -> None:
+    """Raises FloatingPointError if a loss since the last log, not looked at then, is not finite."""
     for name, objective in objectives.items():
-        own = {key: value for key, value in means.items() if key.startswith(f"{name}/")}
+        if not objective.graphs:
+            continue
+        own = {k: value for k, value in meter.means().items() if k.startswith(f"{name}/")}
         with _named(name, step):
             objective.check({key.removeprefix(f"{name}/"): value for key, value in own.items()})
 
