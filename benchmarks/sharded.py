@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import logging
 import shutil
 import subprocess
 import sys
@@ -21,8 +22,11 @@ from time import perf_counter, process_time
 import numpy as np
 import torch
 from tensordict import TensorDict
+from torchrl._utils import logger as torchrl_logger
 
 from torchrl_rad import RetrievalSampler, RetrievalTargetModule, ShardedExpertDatabase
+
+torchrl_logger.setLevel(logging.WARNING)
 
 DIMS = 29
 EPISODE = 1000  # steps
