@@ -280,6 +280,22 @@ def test_weights_of_another_run(tmp_path, policies, data):
         assert all(torch.equal(value, given[key]) for key, value in found.items()), name
 
 
+def test_a_policy_plans_in_its_own_way_with_the_same_weights(data):
+    network = {**NETWORK, "condition": 0.9}
+    own = {**RETRIEVAL["followed"], "planner": {"condition": [0.9, 0.2], "steps": 2}}
+    policies = make_policies(network, {**RETRIEVAL, "followed": own}, data)
+    share_weights(policies, "paper")
+    paper, followed = (policies[name].policy[-1] for name in ("paper", "followed"))
+    assert paper.condition.shares == (0.9, 0.9) and followed.condition.shares == (0.9, 0.2)
+    assert followed.condition.wanted[0] == paper.condition.wanted[0]
+    assert followed.condition.wanted[1] < paper.condition.wanted[1]
+    assert (paper.steps, followed.steps) == (1, 2)
+    state = followed.state_dict()
+    assert all(torch.equal(value, state[key]) for key, value in paper.state_dict().items())
+    description = policies["followed"].description["planner"]
+    assert description["condition"] == [0.9, 0.2]  # what a saved policy is built from
+
+
 def test_no_weights_to_take(tmp_path, policies, data):
     with pytest.raises(CheckpointError, match="holds no trained policy with targets: give a run"):
         take_weights(policies, tmp_path)

@@ -13,6 +13,7 @@ from torchrl_rad.data import (
     episode_length,
     expert_from_config,
     first_hit_within,
+    near_best_return,
     reaches_goal,
     return_at_least,
     subtasks_done,
@@ -89,6 +90,31 @@ def test_share_out_of_range(share):
         top_share_by_return(share)
 
 
+@pytest.mark.parametrize(
+    ("share", "expected"),
+    [
+        (0.0, [False, False, True, False]),
+        (0.4, [False, False, True, False]),  # 5.4 or more
+        (0.5, [True, False, True, True]),  # 4.5 or more
+        (0.7, [True, True, True, True]),
+    ],
+)
+def test_near_best_return(share, expected):
+    episodes = [episode(5), episode(1, 1, 1), episode(3, 6), episode(2, 3)]
+    assert near_best_return(share).select(episodes).tolist() == expected
+
+
+def test_near_the_best_of_negative_returns():
+    episodes = [episode(-10), episode(-11), episode(-12)]
+    assert near_best_return(0.1).select(episodes).tolist() == [True, True, False]
+
+
+@pytest.mark.parametrize("share", [-0.1, 1.0, float("nan")])
+def test_no_share_of_the_best(share):
+    with pytest.raises(ValueError, match=r"share is .*\[0, 1\)"):
+        near_best_return(share)
+
+
 def test_a_share_compares_among_the_episodes_that_come_together():
     rule = top_share_by_return(0.5) & episode_length(2)
     episodes = [episode(9), episode(1, 1), episode(5, 5), episode(0, 0)]
@@ -103,6 +129,7 @@ RULES = st.recursive(
         st.just(reaches_goal()),
         st.integers(1, 2).map(subtasks_done),
         st.just(top_share_by_return(0.4)),
+        st.just(near_best_return(0.4)),
     ),
     lambda rules: st.one_of(
         st.tuples(rules, rules).map(lambda pair: pair[0] & pair[1]),

@@ -45,7 +45,7 @@ def plan(planner):
 
 @given(st.lists(st.floats(-100, 100, width=32), min_size=1), st.floats(0, 1))
 def test_the_wanted_return_is_one_of_the_recorded(returns, share):
-    condition = ReturnCondition(share).fit(torch.tensor(returns))
+    condition = ReturnCondition([share]).fit(torch.tensor(returns))
     wanted = float(condition.wanted)
     assert wanted in returns
     below = sum(value < wanted for value in returns) / len(returns)
@@ -54,7 +54,7 @@ def test_the_wanted_return_is_one_of_the_recorded(returns, share):
 
 
 def test_values_by_hand():
-    condition = ReturnCondition(0.75).fit(torch.tensor([[0.0], [4.0], [0.0], [4.0], [2.0]]))
+    condition = ReturnCondition([0.75]).fit(torch.tensor([[0.0], [4.0], [0.0], [4.0], [2.0]]))
     assert float(condition.wanted) == 4.0  # the fourth of five
     assert float(condition.mean) == 2.0
     assert float(condition.deviation) == pytest.approx(3.2**0.5)
@@ -62,20 +62,20 @@ def test_values_by_hand():
 
 
 def test_equal_returns_have_a_scale():
-    condition = ReturnCondition(0.9).fit(torch.ones(4))
-    assert condition().tolist() == [0.0]
+    condition = ReturnCondition([0.9, 0.1]).fit(torch.ones(4))
+    assert condition().tolist() == [0.0, 0.0]
 
 
 @pytest.mark.parametrize("share", [-0.1, 1.1, float("nan")])
 def test_a_share_that_is_none(share):
     with pytest.raises(ValueError, match="share of returns below the wanted one is"):
-        ReturnCondition(share)
+        ReturnCondition([0.5, share])
 
 
 @pytest.mark.parametrize("returns", [[], [1.0, float("nan")], [float("inf")]])
 def test_returns_that_are_none(returns):
     with pytest.raises(ValueError, match="expected finite returns"):
-        ReturnCondition(0.5).fit(torch.tensor(returns))
+        ReturnCondition([0.5]).fit(torch.tensor(returns))
 
 
 # networks
@@ -118,11 +118,34 @@ def test_plans_depend_on_the_wanted_return_also_after_the_first():
     planner = make_planner()
     planner.condition.fit(torch.arange(5.0))
     before = plan(planner)
-    planner.condition.wanted.fill_(4.0)
+    planner.condition.shares = (1.0, 1.0)
     after = plan(planner)
     assert (after - before).abs().max() > 0.01
-    planner.condition.wanted.fill_(2.0)
+    planner.condition.shares = (0.5, 0.5)
     assert torch.allclose(plan(planner), before)
+
+
+def test_levels_are_told_returns_of_their_own():
+    planner = make_planner([0.5, 1.0])
+    planner.condition.fit(torch.arange(5.0))
+    assert planner.condition.wanted.tolist() == [2.0, 4.0]
+    own, high = plan(planner), plan(make_planner_like(planner, 1.0))
+    low = plan(make_planner_like(planner, 0.5))
+    first = planner.plan_times % JUMPS[0] == 0
+    assert torch.equal(own[:, first], low[:, first])
+    assert (own - low)[:, ~first].abs().max() > 0.01
+    assert (own - high)[:, first].abs().max() > 0.01
+
+
+def make_planner_like(planner, condition):
+    other = make_planner(condition)
+    other.load_state_dict(planner.state_dict())
+    return other
+
+
+def test_as_many_shares_as_levels():
+    with pytest.raises(ValueError, match=r"condition is \[0.5, 0.6, 0.7\]; .* the 2 levels"):
+        make_planner([0.5, 0.6, 0.7])
 
 
 def test_without_a_condition_there_are_no_weights_for_one():
@@ -221,13 +244,13 @@ def data():
 def test_the_wanted_return_is_fitted_and_saved(tmp_path):
     policy = build_policy(DESCRIPTION)
     fit_scales(policy, data())
-    assert float(policy[-1].condition.wanted) == 35.0  # round(0.9 x 39)
+    assert policy[-1].condition.wanted.tolist() == [35.0, 35.0]  # round(0.9 x 39)
     save_policy(tmp_path / "policy", policy, DESCRIPTION)
     again = load_policy(tmp_path / "policy")
     state = TensorDict({"observation": torch.randn(2, 2)}, [2])
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         assert torch.equal(policy(state.clone())["plan"], again(state.clone())["plan"])
-    assert float(again[-1].condition.wanted) == 35.0
+    assert again[-1].condition.wanted.tolist() == [35.0, 35.0]
 
 
 def test_it_has_no_other_goals():

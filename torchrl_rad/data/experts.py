@@ -14,6 +14,7 @@ __all__ = [
     "episode_length",
     "expert_from_config",
     "first_hit_within",
+    "near_best_return",
     "reaches_goal",
     "return_at_least",
     "select_episodes",
@@ -87,18 +88,16 @@ class _Combined(Expert):
         return f"({self.parts[0]} {self.config['rule']} {self.parts[1]})"
 
 
-class _TopShare(Expert):
-    def __init__(self, share: float):
-        if not 0.0 < share <= 1.0:
-            raise ValueError(f"share is {share}; expected a number in (0, 1].")
-        config = {"rule": "top_share_by_return", "args": [share]}
-        super().__init__(config, lambda episode: True)
-        self.share = share
+class _ByReturn(Expert):
+    """Compares episodes that come together; one alone is the best of its kind."""
+
+    def __init__(self, rule: str, share: float, least: Callable[[Tensor], Tensor]):
+        super().__init__({"rule": rule, "args": [share]}, lambda episode: True)
+        self.least = least  # of the returns [E], what is enough
 
     def select(self, episodes: list[TensorDictBase]) -> Tensor:
         returns = torch.stack([_rewards(episode).double().sum() for episode in episodes])
-        keep = max(1, round(self.share * len(episodes)))
-        return returns >= returns.sort(descending=True).values[keep - 1]
+        return returns >= self.least(returns)
 
 
 def _rewards(episode: TensorDictBase) -> Tensor:
@@ -130,6 +129,22 @@ def first_hit_within(low: int, high: int) -> Expert:
         return bool(hit.any()) and low <= int(hit.float().argmax()) + 1 <= high
 
     return Expert({"rule": "first_hit_within", "args": [low, high]}, predicate)
+
+
+def near_best_return(share: float) -> Expert:
+    """Episodes whose undiscounted return is nearly that of the best of those added together.
+
+    Where most episodes are bad, a share of them (:func:`top_share_by_return`) may hold bad ones.
+
+    Args:
+        share (float): how much less is good enough, as a share of the best return, in [0, 1).
+
+    Raises:
+        ValueError: ``share`` lies outside [0, 1).
+    """
+    if not 0.0 <= share < 1.0:
+        raise ValueError(f"share is {share}; expected a number in [0, 1).")
+    return _ByReturn("near_best_return", share, lambda r: r.max() - share * r.max().abs())
 
 
 def reaches_goal() -> Expert:
@@ -167,7 +182,14 @@ def top_share_by_return(share: float) -> Expert:
     Raises:
         ValueError: ``share`` lies outside (0, 1].
     """
-    return _TopShare(share)
+    if not 0.0 < share <= 1.0:
+        raise ValueError(f"share is {share}; expected a number in (0, 1].")
+
+    def least(returns: Tensor) -> Tensor:
+        keep = max(1, round(share * len(returns)))
+        return returns.sort(descending=True).values[keep - 1]
+
+    return _ByReturn("top_share_by_return", share, least)
 
 
 def select_episodes(
@@ -192,6 +214,7 @@ def select_episodes(
 RULES: dict[str, Callable[..., Expert]] = {
     "episode_length": episode_length,
     "first_hit_within": first_hit_within,
+    "near_best_return": near_best_return,
     "reaches_goal": reaches_goal,
     "return_at_least": return_at_least,
     "subtasks_done": subtasks_done,

@@ -75,7 +75,8 @@ def make_policies(
     Args:
         network (mapping): arguments of the planner, and ``step_horizon`` (of target and step
             estimator) and ``step_width`` (of the latter's network).
-        retrieval (mapping): name -> ``expert``, ``gamma``, ``sampler``, ``target``, ``estimator``.
+        retrieval (mapping): name -> ``expert``, ``gamma``, ``sampler``, ``target``, ``estimator``,
+            and ``planner``, what this policy plans otherwise than ``network`` says (no sizes).
         data (TensorDictBase): flat steps [T].
 
     Raises:
@@ -100,7 +101,8 @@ def make_policies(
             )
         database = make_database(data, options)
         estimator = {"width": width, **options["estimator"]}
-        description = {**shared, "target": target, "estimator": estimator}
+        own = {"planner": {**planner, **options.get("planner", {})}}
+        description = {**shared, **own, "target": target, "estimator": estimator}
         policy = build_policy(description, database)
         policies[name] = PolicyParts(policy, description, database)
     for parts in policies.values():

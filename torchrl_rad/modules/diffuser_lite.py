@@ -82,9 +82,10 @@ class DiffuserLitePlanner(Planner):
             it, in units of the changes that the level's grid meets in the data (``changes``, see
             :func:`fit_scales`), rather than as standardised states. One step changes a robot's
             state by a small part of its deviation. Defaults to ``False``.
-        condition (float, optional): the networks are told the return that a plan is to have, here
-            one that this share of the recorded ones lies below (see :class:`ReturnCondition`).
-            Defaults to none: they are told nothing.
+        condition (float or sequence of float, optional): the networks are told the return that a
+            plan is to have, here one that this share of the recorded ones lies below, the same for
+            all levels or one for each (see :class:`ReturnCondition`). Defaults to none: they are
+            told nothing.
         in_keys, out_keys (sequence of NestedKey, optional): new names, in the order of the table.
 
     Raises:
@@ -123,17 +124,12 @@ class DiffuserLitePlanner(Planner):
         placement: str = "shifted",
         database: ExpertDatabase | None = None,
         relative: bool = False,
-        condition: float | None = None,
+        condition: float | Sequence[float] | None = None,
         in_keys: Sequence[NestedKey] | None = None,
         out_keys: Sequence[NestedKey] = ("plan", "action"),
     ):
         levels = plan_levels(horizon, jumps)
-        each = temperature if isinstance(temperature, Sequence) else [temperature] * len(levels)
-        if len(each) != len(levels):
-            raise ValueError(
-                f"temperature is {list(each)}; expected one number, or one for each of the "
-                f"{len(levels)} levels."
-            )
+        each = _one_a_level("temperature", temperature, len(levels))
         super().__init__(
             normalizer,
             make_process(process),
@@ -157,8 +153,9 @@ class DiffuserLitePlanner(Planner):
         self.__dict__["database"] = database  # a handle, as in RetrievalTargetModule
         self.inverse_dynamics = inverse_dynamics
         state_dim = len(normalizer.mean)
-        self.condition = None if condition is None else ReturnCondition(condition)
         conditioned = condition is not None
+        if condition is not None:
+            self.condition = ReturnCondition(_one_a_level("condition", condition, len(levels)))
         self.networks = PlanNetworks(
             DiT(state_dim, level.tokens, width, heads, blocks, conditioned=conditioned)
             for level in self.levels
@@ -256,3 +253,12 @@ class DiffuserLitePlanner(Planner):
         assert self.return_model is not None
         plans = raw.unflatten(0, (len(state), copies))
         return best_plans(plans, self.return_model(plans))
+
+
+def _one_a_level(name: str, value: float | Sequence[float], levels: int) -> list[float]:
+    each = list(value) if isinstance(value, Sequence) else [value] * levels
+    if len(each) != levels:
+        raise ValueError(
+            f"{name} is {each}; expected one number, or one for each of the {levels} levels."
+        )
+    return each

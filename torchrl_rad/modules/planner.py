@@ -189,15 +189,17 @@ class Planner(TensorDictModuleBase):
         dtype = torch.get_autocast_dtype(device.type) if lower else None
         times = self.process.grid(self.steps)[:-1]
 
-        wanted = None if self.condition is None else self.condition()
+        wanted = None if self.condition is None else self.condition()  # [L]
 
         def make() -> list[StepNetwork]:
-            return [self._step_network(net, times, dtype, wanted) for net in self.networks]
+            each = [None] * len(self.networks) if wanted is None else wanted.split(1)
+            pairs = zip(self.networks, each, strict=True)
+            return [self._step_network(network, times, dtype, told) for network, told in pairs]
 
         if device.type != "cpu":
             return make()  # nothing is packed there, and to compare weights would wait for it
         hooked = tuple(map(is_hooked, self.networks))
-        told = None if wanted is None else wanted.item()
+        told = None if wanted is None else tuple(wanted.tolist())
         return self._frozen.get(self.networks, (dtype, hooked, told, *times), make)
 
     def _step_network(
