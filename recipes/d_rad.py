@@ -56,6 +56,8 @@ def main(config: DictConfig) -> None:
     """Reads the command line."""
     cfg = OmegaConf.to_container(config, resolve=True)
     cfg["network"] = cfg.pop("diffuser")
+    for options in cfg["retrieval"].values():
+        options["network"] = options.pop("diffuser", {})
     run_recipe(cfg, make_objectives, "d_rad.py", sweep=HydraConfig.get().mode == RunMode.MULTIRUN)
 
 

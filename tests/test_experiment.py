@@ -282,7 +282,7 @@ def test_weights_of_another_run(tmp_path, policies, data):
 
 def test_a_policy_plans_in_its_own_way_with_the_same_weights(data):
     network = {**NETWORK, "condition": 0.9}
-    own = {**RETRIEVAL["followed"], "planner": {"condition": [0.9, 0.2], "steps": 2}}
+    own = {**RETRIEVAL["followed"], "network": {"condition": [0.9, 0.2], "steps": 2}}
     policies = make_policies(network, {**RETRIEVAL, "followed": own}, data)
     share_weights(policies, "paper")
     paper, followed = (policies[name].policy[-1] for name in ("paper", "followed"))

@@ -55,7 +55,8 @@ FAMILIES = {
         [
             f"retrieval.{name}.expert={{rule: episode_length, args: [{LENGTH}]}}"
             for name in ("paper", "highest")
-        ],
+        ]
+        + ["retrieval.followed.network.condition=[0.95,0.2]"],  # of the two levels here
         {"length": "steps"},
     ),
     "antmaze": (

@@ -76,7 +76,7 @@ def make_policies(
         network (mapping): arguments of the planner, and ``step_horizon`` (of target and step
             estimator) and ``step_width`` (of the latter's network).
         retrieval (mapping): name -> ``expert``, ``gamma``, ``sampler``, ``target``, ``estimator``,
-            and ``planner``, what this policy plans otherwise than ``network`` says (no sizes).
+            and ``network``, how this policy plans otherwise, with the same weights.
         data (TensorDictBase): flat steps [T].
 
     Raises:
@@ -101,7 +101,7 @@ def make_policies(
             )
         database = make_database(data, options)
         estimator = {"width": width, **options["estimator"]}
-        own = {"planner": {**planner, **options.get("planner", {})}}
+        own = {"planner": {**planner, **options.get("network", {})}}
         description = {**shared, **own, "target": target, "estimator": estimator}
         policy = build_policy(description, database)
         policies[name] = PolicyParts(policy, description, database)
