@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import pytest
 
-RAY = {"test_shards_in_ray_actors"}  # starts a Ray of its own
-
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Those of a file share its fixtures; those of Ray must not start two of them at once."""
+    """Those of a file, for its fixtures; and all files with Ray, of which one runs at a time."""
     if not config.pluginmanager.hasplugin("xdist"):
         return
+    on_ray = {
+        item.path
+        for item in items
+        if "ray" in getattr(item, "fixturenames", ()) or item.name == "test_shards_in_ray_actors"
+    }
     for item in items:
-        on_ray = "ray" in getattr(item, "fixturenames", ()) or item.name in RAY
-        item.add_marker(pytest.mark.xdist_group("ray" if on_ray else str(item.path)))
+        item.add_marker(pytest.mark.xdist_group("ray" if item.path in on_ray else str(item.path)))
