@@ -525,14 +525,9 @@ def test_shards_in_several_processes(tmp_path):
     assert_a_hidden_shard_is_named(many, states)
 
 
-def test_shards_in_ray_actors(tmp_path):
-    ray = pytest.importorskip("ray")
-    ray.init(num_cpus=2, include_dashboard=False, log_to_driver=False)
-    try:
-        _, many, states = assert_workers_serve("ray", tmp_path / "many")
-        assert_a_hidden_shard_is_named(many, states)
-    finally:
-        ray.shutdown()
+def test_shards_in_ray_actors(ray, tmp_path):
+    _, many, states = assert_workers_serve("ray", tmp_path / "many")
+    assert_a_hidden_shard_is_named(many, states)
 
 
 def test_ray_is_an_extra(tmp_path, monkeypatch):

@@ -35,14 +35,3 @@ def whole(tmp_path_factory):
     ran = subprocess.run(command, capture_output=True, text=True, cwd=base)
     assert ran.returncode == 0, ran.stderr
     return RunFolder.open(base / "run"), ran.stdout
-
-
-@pytest.fixture
-def ray():
-    """Ray on this machine, whose workers do not give way to other processes."""
-    module = pytest.importorskip("ray", reason='needs ray: pip install "torchrl_rad[ray]"')
-    options = {"include_dashboard": False, "log_to_driver": False, "logging_level": "ERROR"}
-    with mock.patch.dict(os.environ, RAY_worker_niceness="0"):
-        module.init(num_cpus=2, object_store_memory=200 * 2**20, **options)
-        yield module
-        module.shutdown()

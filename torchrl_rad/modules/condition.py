@@ -27,9 +27,6 @@ class ReturnCondition(nn.Module):
         shares (sequence of float): of the recorded returns that lie below the one wanted, in
             [0, 1], one for each level; can be set anew.
 
-    Attributes:
-        wanted (Tensor): the returns asked for, one a level, in units of return.
-
     Raises:
         ValueError: a share lies outside [0, 1].
 
@@ -73,6 +70,7 @@ class ReturnCondition(nn.Module):
 
     @property
     def wanted(self) -> Tensor:
+        """The returns asked for, [L]."""
         return torch.stack([self.quantiles[round(s * (QUANTILES - 1))] for s in self.shares])
 
     def forward(self, returns: Tensor | None = None) -> Tensor:
