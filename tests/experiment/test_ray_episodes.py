@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import gc
 import os
 import pickle
 import signal
@@ -64,6 +65,11 @@ def alive(ray):
     """Process ids of the workers that have started."""
     actors = ray._private.state.actors().values()
     return [a["Pid"] for a in actors if a["State"] == "ALIVE" and a["Pid"]]
+
+
+def collectors():
+    """How many Ray collectors there are."""
+    return sum(type(thing) is RayCollector for thing in gc.get_objects())
 
 
 def test_same_episodes_as_in_one_process(two, folder):
@@ -140,9 +146,12 @@ def test_what_a_worker_refuses(two, folder, tmp_path):
 
 def test_a_worker_that_cannot_start(ray, tmp_path):
     unseen = PolicyFactory(str(tmp_path / "policy"))
-    with pytest.raises(CheckpointError, match="lost for good: FileNotFoundError: a worker on"):
+    before = collectors()
+    with pytest.raises(CheckpointError, match="lost for good: FileNotFoundError: a worker on") as e:
         RayEpisodes(TASK, unseen, workers=1, unit_rows=ROWS)
     assert ray.is_initialized()
+    # one left over would start Ray anew when it is collected after Ray's end
+    assert e.tb is not None and collectors() == before
 
 
 def test_more_workers_than_cpus(ray, folder):
@@ -167,6 +176,7 @@ def test_torchrl_s_own_collector_fills_a_database(ray, folder):
     )
     database = ExpertDatabase(LazyTensorStorage(1000))
     (steps,) = collector
+    collector.shutdown()
     database.extend(steps)
     assert len(database) == 300 and database[:]["target"].shape == (300, 4)
 

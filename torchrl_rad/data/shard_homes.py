@@ -186,7 +186,8 @@ class RayHome:
         return partial(self.ray.get, getattr(self.actor, name).remote(*args))
 
     def close(self) -> None:
-        self.ray.kill(self.actor)
+        if self.ray.is_initialized():  # its end was the actor's; to ask it would start it anew
+            self.ray.kill(self.actor)
 
 
 def make_homes(workers: str | None, count: int, config: dict[str, Any]) -> list[Home]:

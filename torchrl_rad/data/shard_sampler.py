@@ -73,7 +73,7 @@ class ShardSampler(RetrievalSampler):
         asked = query.detach().to("cpu", torch.float64).numpy()
         try:
             waits = [home.call("nearest", asked, k) for home in self._told_homes()]
-            found = [tuple(map(torch.from_numpy, wait())) for wait in waits]
+            found = [tuple(map(torch.tensor, wait())) for wait in waits]
         except BrokenExecutor as error:
             self.close()
             raise RuntimeError(

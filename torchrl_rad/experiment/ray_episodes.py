@@ -10,6 +10,7 @@ Ray's actors, which a RayCollector passes on, start a dead worker anew and drive
 from __future__ import annotations
 
 import logging
+import traceback
 import warnings
 from collections.abc import Sequence
 from dataclasses import replace
@@ -147,11 +148,12 @@ class RayEpisodes:
                     remote_configs=dict(ACTOR),
                     weight_sync_schemes={},  # policies come from paths
                 )
-        except ray.exceptions.RayActorError as error:
+        except BaseException as error:
+            # the half-made collector goes now: its `__del__` calls Ray, which would start it anew
+            traceback.clear_frames(error.__traceback__)
             self._stop(ray)
-            raise _refusal(error) from error
-        except BaseException:
-            self._stop(ray)
+            if isinstance(error, ray.exceptions.RayActorError):
+                raise _refusal(error) from error
             raise
 
     def drive(
