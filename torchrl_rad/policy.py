@@ -157,8 +157,8 @@ def with_goals(
     Args:
         policy (TensorDictSequential): of :func:`build_policy`, with targets; its weights are
             shared.
-        database (ExpertDatabase): of all recorded episodes, not only those that reach one goal; not
-            a sharded one.
+        database (ExpertDatabase or ShardedExpertDatabase): of all recorded episodes, not only
+            those that reach one goal.
         goal_key (NestedKey, optional): the goal [*B, G]. Defaults to ``"goal"``.
         goal_reward (GoalReward, optional): when it is reached. Defaults to within 0.5 of it.
 

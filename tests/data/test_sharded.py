@@ -312,9 +312,6 @@ def test_bad_settings(tmp_path):
         ShardedExpertDatabase.loads(tmp_path / "many", workers="threads")
     with pytest.raises(ValueError, match="count is 0; at least one worker"):
         ShardedExpertDatabase.loads(tmp_path / "many", workers="process", count=0)
-    for options in ({"goal_key": "goal"}, {"among": 2}):
-        with pytest.raises(ValueError, match="goal_key and among need a table of all rows"):
-            RetrievalTargetModule(many, **options)
     many.extend(walks(3))
     with pytest.raises(ValueError, match="the query has 2 entries, a state of the database 3"):
         many.retrieve(torch.zeros(4, 2))

@@ -154,7 +154,7 @@ def test_neighbours_are_of_demonstrations(monkeypatch, more, threshold):
     """However few rows are looked at first."""
     monkeypatch.setattr(goal_rules, "MORE", more)
     database, _ = walk(threshold=threshold)
-    table = GoalTable(database[:], "observation", 0.9, GoalReward(0.5))
+    table = GoalTable([database[:]], "observation", 0.9, GoalReward(0.5))
     wanted = torch.rand(6, 2, generator=torch.Generator().manual_seed(1)) * 4
     number, returns = table.look_up(wanted)
     query = database[:]["observation"][::100] + 0.01
@@ -207,7 +207,7 @@ def test_the_goal_of_another_row_does_not_show():
 
 def test_few_rows_are_held_for_goals():
     database, following = walk()
-    table = GoalTable(database[:], "observation", 0.9, GoalReward(0.5))
+    table = GoalTable([database[:]], "observation", 0.9, GoalReward(0.5))
     _, returns = table.look_up(following[::60])
     sizes = (returns.share * len(following)).round().long().tolist()
     made, most = [], sizes[0] + sizes[1]

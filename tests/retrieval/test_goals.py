@@ -25,7 +25,7 @@ def rows(lengths=(40, 1, 60), width=2, seed=0):
 @pytest.mark.parametrize("gamma", [0.0, 0.3, 0.97, 1.0])
 def test_returns_are_those_of_relabelled_steps(gamma):
     steps, lengths = rows()
-    table = GoalTable(steps, "observation", gamma, GoalReward())
+    table = GoalTable([steps], "observation", gamma, GoalReward())
     goals = steps["next", "observation"][::7]
     number, returns = table.look_up(goals)
     every = torch.arange(len(steps))
@@ -46,7 +46,7 @@ def test_first_visits_by_hand():
     step, remaining = step_and_remaining(torch.tensor([5]))
     steps = TensorDict({"observation": state, "step": step, "remaining": remaining}, [5])
     # the states after the rows: 1, 2, 1, 0, and that of the last row itself, 0
-    table = GoalTable(steps, "observation", 0.5, GoalReward(0.1, first_visit=True))
+    table = GoalTable([steps], "observation", 0.5, GoalReward(0.1, first_visit=True))
     number, returns = table.look_up(torch.tensor([[1.0]]))
     value, end = returns.value_and_end(torch.arange(5), number.expand(5))
     assert value.tolist() == [1.0, 0.5, 1.0, 0.0, 0.0]
@@ -58,7 +58,7 @@ def test_dims_and_a_goal_of_another_width():
     reward = GoalReward(0.5, dims=[2])
     found = reward(steps["observation"], torch.tensor([0.0]))
     assert torch.equal(found, steps["observation"][:, 2].abs() <= 0.5)
-    table = GoalTable(steps, "observation", 0.9, reward)
+    table = GoalTable([steps], "observation", 0.9, reward)
     with pytest.raises(ValueError, match=r"a goal has 2 entries, compared with entries \[2\] of a"):
         table.look_up(torch.zeros(1, 2))
     with pytest.raises(ValueError, match="a goal has 4 entries"):
@@ -70,7 +70,7 @@ def test_dims_and_a_goal_of_another_width():
 @pytest.mark.parametrize("bad", [float("nan"), float("inf"), 1e30])
 def test_a_goal_that_nobody_reaches(bad):
     steps, _ = rows()
-    table = GoalTable(steps, "observation", 0.9, GoalReward())
+    table = GoalTable([steps], "observation", 0.9, GoalReward())
     number, returns = table.look_up(torch.tensor([[0.0, bad], [0.0, bad]]))
     assert returns.share[number].tolist() == [0.0, 0.0]
     every = torch.arange(len(steps))
@@ -81,7 +81,7 @@ def test_a_goal_that_nobody_reaches(bad):
 def test_expert_rules_follow_the_goal():
     steps, lengths = rows()
     rule = first_hit_within(1, 10)
-    table = GoalTable(steps, "observation", 0.9, GoalReward(), partial(select_episodes, rule))
+    table = GoalTable([steps], "observation", 0.9, GoalReward(), partial(select_episodes, rule))
     goals = steps["next", "observation"][::5]
     number, returns = table.look_up(goals)
     seen = set()
@@ -94,7 +94,7 @@ def test_expert_rules_follow_the_goal():
 
 def test_each_goal_is_searched_once(monkeypatch):
     steps, _ = rows()
-    table = GoalTable(steps, "observation", 0.9, GoalReward())
+    table = GoalTable([steps], "observation", 0.9, GoalReward())
     seen, reached = [], GoalReward.reached
     monkeypatch.setattr(
         GoalReward,
@@ -113,7 +113,7 @@ def test_each_goal_is_searched_once(monkeypatch):
 def test_old_goals_are_given_up(monkeypatch):
     monkeypatch.setattr(module, "GOALS", 3)
     steps, _ = rows()
-    table = GoalTable(steps, "observation", 0.9, GoalReward())
+    table = GoalTable([steps], "observation", 0.9, GoalReward())
     for i in range(10):
         table.look_up(torch.tensor([[float(i), 0.0], [0.0, 0.0]]))
         assert len(table.goals) <= 3 and (0.0, 0.0) in table.goals

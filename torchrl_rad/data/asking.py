@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any, Self
 
 import torch
-from tensordict import TensorDict
+from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import TensorDictReplayBuffer
 
@@ -30,6 +30,11 @@ class AskedReplayBuffer(TensorDictReplayBuffer):
     def columns(self) -> Any:
         """The columns by their keys, for reading some rows: ``columns["step"][index]``."""
         return self[:]
+
+    @property
+    def tables(self) -> list[TensorDictBase]:
+        """All rows, in tables of whole episodes."""
+        return [self[:]]
 
     def __copy__(self) -> Self:
         return self

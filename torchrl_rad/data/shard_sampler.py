@@ -14,6 +14,7 @@ from torch import Tensor
 from torchrl_rad.data.database import ExpertDatabase
 from torchrl_rad.data.shard_homes import Home, LocalHome, make_homes
 from torchrl_rad.data.shards import Shard, moments, scale_of
+from torchrl_rad.retrieval.backends import build_index
 from torchrl_rad.retrieval.index import SearchIndex
 from torchrl_rad.retrieval.merged import merged
 from torchrl_rad.retrieval.sampler import RetrievalSampler
@@ -55,14 +56,14 @@ class ShardSampler(RetrievalSampler):
         if tail is not self.tail:
             self.tail_home = None
         self.shards, self.opened, self.tail = shards, opened, tail
-        self.stale = True
+        self.stale, self._scale = True, None
 
     def nearest(
         self, storage: Any, query: Tensor, k: int | None = None, among: SearchIndex | None = None
     ) -> tuple[Tensor, Tensor]:
         """As :meth:`RetrievalSampler.nearest`."""
         if among is not None:
-            raise NotImplementedError("a sharded database has no search structures of some rows.")
+            return super().nearest(storage, query, k, among)
         k = min(self.k if k is None else k, len(storage))
         if k == 0:
             rows = torch.full((len(query), 0), -1)
@@ -93,8 +94,28 @@ class ShardSampler(RetrievalSampler):
         """The storage: it stays the same object, whatever is added."""
         return storage
 
+    def compared(self, storage: Any) -> int:
+        """As :meth:`RetrievalSampler.compared`."""
+        states = storage.tables[0].get(self.key)
+        return states.shape[-1] if self.dims is None else len(self.dims)
+
     def subset(self, storage: Any, rows: Tensor) -> SearchIndex:
-        raise NotImplementedError("a sharded database has no search structures of some rows.")
+        """As :meth:`RetrievalSampler.subset`; it is here, in memory, whatever the workers."""
+        states = storage.column(self.key).index_select(0, rows)
+        self._fit(states.shape[-1])
+        return build_index(self._prepare(states), self.metric, "auto", self.k)
+
+    def _ready(self, storage: Any, query: Tensor) -> tuple[Any, Tensor, Tensor | None]:
+        self._fit(storage.tables[0].get(self.key).shape[-1])
+        return None, *self._asked(query, "cpu")
+
+    def _fit(self, width: int) -> None:
+        self._check_dims(width)
+        self._width = width
+        if self.normalize and self._scale is None:
+            mean, deviation = map(torch.from_numpy, self._scale_of_all())
+            dims = slice(None) if self.dims is None else self.dims
+            self._scale = mean[dims], deviation[dims]
 
     def invalidate(self) -> None:
         """Drops all search structures and ends the workers; the next query starts new ones."""

@@ -376,6 +376,11 @@ class ShardedExpertDatabase(SavedShards):
         """The columns by their keys, for reading some rows: ``columns["step"][index]``."""
         return ShardColumns(self._storage)
 
+    @property
+    def tables(self) -> list[TensorDictBase]:
+        """All rows, in tables of whole episodes; their ids are those in the shards."""
+        return self._storage.tables
+
     def relabel(self, *args: Any, **kwargs: Any) -> NoReturn:
         """Refuses: shards do not change; so do ``forget`` and ``keep``."""
         raise NotImplementedError(

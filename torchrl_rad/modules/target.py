@@ -24,6 +24,7 @@ from torchrl_rad.retrieval.rules import (
     NoisyRule,
     RankedRule,
     TargetRule,
+    TolerantRule,
     followed_rule,
     highest_rule,
 )
@@ -37,7 +38,7 @@ QUERIES = 4096  # asked at a time: each has k neighbours
 
 class _Columns(NamedTuple):
     source: object  # the search structure that they belong to
-    version: int  # of the database
+    content: tuple[int, int]  # rows of the database, and its version
     states: Tensor | ShardColumn
     rule: TargetRule
 
@@ -85,8 +86,8 @@ class RetrievalTargetModule(TensorDictModuleBase):
     ==================  ========================  ==================================================
 
     Args:
-        database (ExpertDatabase or ShardedExpertDatabase): the demonstrations. A sharded one takes
-            neither ``goal_key`` nor ``among``.
+        database (ExpertDatabase or ShardedExpertDatabase): the demonstrations. Of a sharded one
+            ``goal_key`` holds some 30 bytes a row in memory.
         horizon (int, optional): H; a target is at most H - 1 recorded steps ahead. The planner's H,
             or less: the paper's rule does not count the way, so that with a large one it leaves
             what pays for what pays later. Defaults to ``129``.
@@ -174,11 +175,6 @@ class RetrievalTargetModule(TensorDictModuleBase):
             raise ValueError(f"tolerance is {tolerance}; with a goal_key it must be 0.")
         if goal_key is None and goal_reward is not None:
             raise ValueError("goal_reward is given without a goal_key; pass both or neither.")
-        if isinstance(database, ShardedExpertDatabase) and (goal_key is not None or among > 1):
-            raise ValueError(
-                "goal_key and among need a table of all rows in memory, which a sharded database "
-                "does not have; pass an ExpertDatabase, or leave both out."
-            )
         # a handle, out of reach of parameters, buffers and state_dict
         self.__dict__["database"] = database
         self.horizon, self.rule, self.tolerance, self.ahead = horizon, rule, tolerance, ahead
@@ -302,36 +298,35 @@ class RetrievalTargetModule(TensorDictModuleBase):
 
     def _prepare(self) -> _Columns:
         """The columns of the database as it is; made anew when its search structure was."""
-        source = self.database.sampler.build(self.database.storage)
-        version, columns = self.database.version, self._columns
-        if columns is None or columns.source is not source or columns.version != version:
-            rows = self.database.columns
-            key, rule = self.database.sampler.key, self._make_rule(rows)
-            self._columns = columns = _Columns(source, version, rows[key], rule)
+        database = self.database
+        source = database.sampler.build(database.storage)
+        content, columns = (len(database), database.version), self._columns
+        if columns is None or columns.source is not source or columns.content != content:
+            rows = database.columns
+            rule, states = self._make_rule(rows), rows[database.sampler.key]
+            self._columns = columns = _Columns(source, content, states, rule)
         return columns
 
     def _make_rule(self, rows: TensorDictBase | ShardColumns) -> TargetRule:
         """The rule on the content of the database, [N]."""
-        if isinstance(rows, ShardColumns):
-            ahead = self.ahead if self.rule == "followed" else None
-            returns, left = rows["return_to_go"], rows["remaining"]
-            return WindowedRule(returns, left, self.horizon, self.min_offset, self.tolerance, ahead)
-        values, remaining = rows["return_to_go"], rows["remaining"]
+        ahead = self.ahead if self.rule == "followed" else None
         if self.goal_key is not None:
-            limits = (self._experts(), self.horizon)
-            key, gamma = self.database.sampler.key, self.database.gamma
-            table = GoalTable(rows, key, gamma, self.goal_reward, *limits)
-            ahead = self.ahead if self.rule == "followed" else None
-            rule: TargetRule = GoalRule(table, self.horizon, self.min_offset, ahead)
-        elif self.rule == "followed":
-            rule = followed_rule(values, remaining, self.ahead)
+            database, limits = self.database, (self._experts(), self.horizon)
+            about = (database.sampler.key, database.gamma, self.goal_reward)
+            table = GoalTable(database.tables, *about, *limits)
+            return GoalRule(table, self.horizon, self.min_offset, ahead)
+        window = (self.horizon, self.min_offset, self.tolerance)
+        rule: WindowedRule | RankedRule | TolerantRule
+        if isinstance(rows, ShardColumns):
+            rule = WindowedRule(rows["return_to_go"], rows["remaining"], *window, ahead)
+        elif ahead is not None:
+            rule = followed_rule(rows["return_to_go"], rows["remaining"], ahead)
         else:
-            settings = (self.horizon, self.min_offset, self.tolerance)
-            rule = highest_rule(values, remaining, *settings)
-        if self.among > 1:
-            assert isinstance(rule, RankedRule)
-            rule = NoisyRule(rule, self.among)
-        return rule
+            rule = highest_rule(rows["return_to_go"], rows["remaining"], *window)
+        if self.among == 1:
+            return rule
+        assert not isinstance(rule, TolerantRule)
+        return NoisyRule(rule, self.among)
 
     # keeping a target for several steps
 

@@ -62,7 +62,7 @@ def goal_neighbours(
 
 def _most(sampler: RetrievalSampler, storage: Any) -> int:
     """Rows in the structures of all goals."""
-    return goals.SUBSET_ENTRIES // sampler.build(storage).rows.shape[-1]
+    return goals.SUBSET_ENTRIES // sampler.compared(storage)
 
 
 def _in_subsets(sampler, storage, query, table, returns, goal, todo) -> Iterator[Found]:

@@ -153,7 +153,9 @@ class GoalTable:
     """Finds the rows near each goal, once for each goal.
 
     Args:
-        rows (TensorDictBase): content of a database, [N].
+        tables (sequence of TensorDictBase): content of a database, [N] in all, each of whole
+            episodes. Of each of its N rows some 30 bytes are held, beside the entries of a state
+            that are compared with a goal.
         key (NestedKey): the state in it.
         gamma (float): discount of the returns.
         reward (GoalReward): when a goal is reached.
@@ -168,7 +170,7 @@ class GoalTable:
         >>> rows = TensorDict({
         ...     "observation": state, "next": {"observation": state + 1},
         ...     "step": torch.arange(4), "remaining": torch.arange(3, -1, -1)}, [4])
-        >>> table = GoalTable(rows, "observation", 0.5, GoalReward(radius=0.1))
+        >>> table = GoalTable([rows], "observation", 0.5, GoalReward(radius=0.1))
         >>> number, returns = table.look_up(torch.tensor([[3.0], [9.0], [3.0]]))
         >>> number, returns.experts
         (tensor([0, 1, 0]), tensor([[ True],
@@ -179,22 +181,21 @@ class GoalTable:
 
     def __init__(
         self,
-        rows: TensorDictBase,
+        tables: Sequence[TensorDictBase],
         key: Any,
         gamma: float,
         reward: GoalReward,
         experts: Callable[[Sequence[TensorDictBase]], Tensor] | None = None,
         longest: int | None = None,
     ):
-        step, remaining = rows["step"], rows["remaining"]
-        self.rows, self.gamma, self.reward, self.longest = rows, gamma, reward, longest
-        self.experts = experts
-        self.row = torch.arange(len(step), device=step.device)
-        self.last = self.row + remaining
-        starts = self.row[step == 0]
+        step, remaining = (torch.cat([t[name] for t in tables]) for name in ("step", "remaining"))
+        self.tables, self.key, self.gamma, self.reward = tables, key, gamma, reward
+        self.experts, self.longest = experts, longest
+        row = torch.arange(len(step), device=step.device)
+        self.last = row + remaining
+        starts = row[step == 0]
         self.lengths = torch.diff(starts, append=starts.new_tensor([len(step)]))
         self.episode = torch.repeat_interleave(torch.arange(len(starts)), self.lengths)
-        self.following = _following(rows, key, remaining)
         self.places: Tensor | None = None  # of them the entries that a goal has
         self.goals: dict[tuple[float, ...], _Goal] = {}
         self.batch: tuple[Any, GoalReturns] | None = None
@@ -206,7 +207,7 @@ class GoalTable:
         Raises:
             ValueError: goals of another width.
         """
-        goals = goals.detach().to(self.following.device, torch.float64)
+        goals = goals.detach().to(self.last.device, torch.float64)
         goals = torch.where(goals.isfinite(), goals, torch.inf)  # what nobody reaches
         distinct, number = goals.unique(dim=0, return_inverse=True)
         names = tuple(map(tuple, distinct.tolist()))
@@ -257,7 +258,8 @@ class GoalTable:
             self.goals[name] = self.goals.pop(name)  # the last one used
             return self.goals[name]
         if self.places is None or self.places.shape[1] != len(name):
-            self.places = self.reward.places(self.following, len(name)).contiguous()
+            following = (_following(table, self.key) for table in self.tables)
+            self.places = torch.cat([self.reward.places(one, len(name)) for one in following])
         near = self.reward.reached(self.places, torch.tensor(name, dtype=torch.float64))
         hits = near.nonzero()[:, 0]
         returns = torch.ones(len(hits), dtype=torch.float64, device=hits.device)
@@ -274,16 +276,24 @@ class GoalTable:
         reaches[self.episode[hits]] = True
         if self.experts is None or not reaches.any():
             return reaches
-        steps = self.rows.copy().set(("next", "reward"), near.float()[:, None])
-        episodes = steps[reaches[self.episode]].split(self.lengths[reaches].tolist())
-        return reaches.masked_scatter(reaches, self.experts(episodes).to(reaches.device))
+        asked = reaches[self.episode]
+        kept, end, lengths = [], 0, self.lengths[reaches]
+        for table in self.tables:
+            rows = slice(end, end := end + len(table))
+            steps = table.copy().set(("next", "reward"), near[rows].float()[:, None])[asked[rows]]
+            count = int((steps["step"] == 0).sum())
+            if count:
+                kept.append(self.experts(steps.split(lengths[:count].tolist())))
+                lengths = lengths[count:]
+        return reaches.masked_scatter(reaches, torch.cat(kept).to(reaches.device))
 
 
-def _following(rows: TensorDictBase, key: Any, remaining: Tensor) -> Tensor:
+def _following(rows: TensorDictBase, key: Any) -> Tensor:
     """The state after each row; where the last one's of an episode is not recorded, its own."""
     recorded = rows.get(("next", key) if isinstance(key, str) else ("next", *key), None)
     if recorded is not None:
         return recorded
+    remaining = rows["remaining"]
     row = torch.arange(len(remaining), device=remaining.device)
     return rows.get(key)[row + remaining.clamp_max(1)]
 

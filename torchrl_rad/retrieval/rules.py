@@ -74,9 +74,23 @@ class RankedRule(NamedTuple):
         row, near, hit = sampler.best(storage, query, self.rank)
         return Choice(self.target.index_select(0, row.clamp_min(0)), row, near, hit)
 
+    def ranked(self, rows: Tensor) -> tuple[Tensor, Tensor]:
+        """As :meth:`Ranks.ranked`."""
+        return self.target[rows], self.rank[rows]
+
     def value(self, rows: Tensor, goals: Tensor | None = None) -> Tensor:
         """As :meth:`TargetRule.value`."""
         return self.values.index_select(0, rows)
+
+
+class Ranks(Protocol):
+    """A rule by which the neighbours of a query can be put in order."""
+
+    def ranked(self, rows: Tensor) -> tuple[Tensor, Tensor]:
+        """For neighbours [Q, k] the row to go for through each, and its rank, not negative."""
+
+    def value(self, rows: Tensor, goals: Tensor | None = None) -> Tensor:
+        """As :meth:`TargetRule.value`."""
 
 
 class NoisyRule(NamedTuple):
@@ -89,7 +103,7 @@ class NoisyRule(NamedTuple):
         among: number of targets; fewer where there are no more.
     """
 
-    rule: RankedRule
+    rule: Ranks
     among: int
 
     def choose(
@@ -98,8 +112,8 @@ class NoisyRule(NamedTuple):
         """As :meth:`TargetRule.choose`; drawn with torch's global generator."""
         rows, near = sampler.nearest(storage, query)  # [Q, k]
         valid = near >= sampler.threshold
-        targets = self.rule.target[rows.clamp_min(0)]
-        left = torch.where(valid, self.rule.rank[rows.clamp_min(0)], -1)
+        targets, rank = self.rule.ranked(rows.clamp_min(0))
+        left = torch.where(valid, rank, -1)
         places = []
         for _ in range(self.among):
             place = left.argmax(-1, keepdim=True)  # of equals the more similar one

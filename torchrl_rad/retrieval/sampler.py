@@ -231,13 +231,16 @@ class RetrievalSampler(Sampler):
     def _ready(self, storage: Any, query: Tensor) -> tuple[SearchIndex, Tensor, Tensor | None]:
         """The search structure, queries as it wants them, and which are finite if not all are."""
         index = self.build(storage)
+        return index, *self._asked(query, index.rows.device)
+
+    def _asked(self, query: Tensor, device: Any) -> tuple[Tensor, Tensor | None]:
         self._check_query(query, self._width)
-        query = query.detach().to(index.rows.device, torch.float64)
+        query = query.detach().to(device, torch.float64)
         finite = query.isfinite().all(-1, keepdim=True)
         whole = bool(finite.all())
         if not whole:
             query = torch.where(finite, query, 0.0)
-        return index, self._prepare(query), None if whole else finite
+        return self._prepare(query), None if whole else finite
 
     def _check_query(self, query: Tensor, width: int) -> None:
         """Raises ValueError for a query of another width than the states."""
@@ -286,6 +289,10 @@ class RetrievalSampler(Sampler):
         # a constant entry stays as it is; its deviation may differ from 0 by rounding
         varies = rows.amax(0) > rows.amin(0)
         return rows.mean(0), torch.where(varies, rows.std(0, correction=0), 1.0)
+
+    def compared(self, storage: Any) -> int:
+        """Number of entries of a state that are compared."""
+        return self.build(storage).rows.shape[-1]
 
     def subset(self, storage: Any, rows: Tensor) -> SearchIndex:
         """A search structure of some rows, int64 [M], of the storage as it is now."""

@@ -53,9 +53,9 @@ class WindowedRule:
         rows, near = sampler.nearest(storage, query)  # [Q, k]
         valid = near >= sampler.threshold
         if self.ahead is not None:
-            target, place = self._followed(rows.clamp_min(0), valid, self.ahead)
+            target, place = self._followed(rows.clamp_min(0), valid)
         else:
-            many = max(1, WINDOW_ENTRIES // (rows.shape[1] * self.horizon))
+            many = self._at_a_time(rows)
             parts = zip(rows.clamp_min(0).split(many), valid.split(many), strict=True)
             found = [self._highest(*part) for part in parts]
             target, place = (torch.cat(column) for column in zip(*found, strict=True))
@@ -67,35 +67,62 @@ class WindowedRule:
         """As :meth:`~torchrl_rad.retrieval.rules.TargetRule.value`."""
         return self.values.index_select(0, rows)
 
+    def ranked(self, rows: Tensor) -> tuple[Tensor, Tensor]:
+        """As :meth:`~torchrl_rad.retrieval.rules.Ranks.ranked`; ranks are of these rows alone."""
+        parts = rows.split(self._at_a_time(rows))
+        best = [self._returns(part, *self._limits(part)[1:]).argmax(-1) for part in parts]
+        target = rows + torch.cat(best)  # the first of equals
+        if self.ahead is not None:
+            return target, self._read(self.values, rows).unique(return_inverse=True)[1]
+        # by return, then steps left, then the lower row
+        merits = (self._read(self.values, target), self._read(self.remaining, target), -target)
+        order = torch.stack([column.double() for column in merits], -1)  # [Q, k, 3]
+        rank = order.flatten(0, 1).unique(dim=0, return_inverse=True)[1]
+        return target, rank.view(rows.shape)
+
+    def _at_a_time(self, rows: Tensor) -> int:
+        """Queries whose windows are held at a time."""
+        return max(1, WINDOW_ENTRIES // (rows.shape[1] * self.horizon))
+
     def _read(self, column: Column, rows: Tensor) -> Tensor:
         return column.index_select(0, rows.flatten()).view(rows.shape)
 
-    def _followed(self, rows: Tensor, valid: Tensor, ahead: int) -> tuple[Tensor, Tensor]:
+    def _limits(self, rows: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Steps left from rows [Q, k], and how far ahead the first and last allowed target lie."""
+        left = self._read(self.remaining, rows)
+        if self.ahead is not None:
+            return left, torch.zeros_like(left), left.clamp_max(self.ahead)
+        return left, left.clamp_max(self.min_offset), left.clamp_max(self.horizon - 1)
+
+    def _returns(self, rows: Tensor, low: Tensor, high: Tensor) -> Tensor:
+        """Returns of the rows low..high ahead of each of rows [Q, k]: [Q, k, L], others -inf."""
+        length = self.horizon if self.ahead is None else self.ahead + 1
+        window = self.values.windows(rows.flatten(), length).view(*rows.shape, length)
+        step = torch.arange(length, device=rows.device)
+        inside = (low[..., None] <= step) & (step <= high[..., None])
+        return torch.where(inside, window, -torch.inf)
+
+    def _followed(self, rows: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
         """Row to go for, [Q], and place of its neighbour, [Q, 1]; rows and valid are [Q, k]."""
         value = torch.where(valid, self._read(self.values, rows), -torch.inf)
         place = value.argmax(-1, keepdim=True)  # of equals the first: the most similar
         row = rows.gather(-1, place)
-        window = self.values.windows(row[:, 0], ahead + 1)
-        inside = torch.arange(ahead + 1, device=row.device) <= self._read(self.remaining, row)
-        return row[:, 0] + torch.where(inside, window, -torch.inf).argmax(-1), place
+        _, low, high = self._limits(row)
+        return (row + self._returns(row, low, high).argmax(-1))[:, 0], place
 
     def _highest(self, rows: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
         """As :meth:`_followed`."""
-        left = self._read(self.remaining, rows)
-        low, high = left.clamp_max(self.min_offset), left.clamp_max(self.horizon - 1)
-        window = self.values.windows(rows.flatten(), self.horizon).view(*rows.shape, self.horizon)
-        step = torch.arange(self.horizon, device=rows.device)
-        inside = (low[..., None] <= step) & (step <= high[..., None])  # [Q, k, H]
-        peak = torch.where(inside, window, -torch.inf).amax(-1)
-        top = torch.where(valid, peak, -torch.inf).amax(-1)[:, None, None]
+        left, low, high = self._limits(rows)
+        returns = self._returns(rows, low, high)  # [Q, k, H]
+        top = torch.where(valid, returns.amax(-1), -torch.inf).amax(-1)[:, None, None]
         # float64: the difference of two float32 would be rounded
-        good = inside & (top.double() - window.double() <= self.tolerance)
+        good = top.double() - returns.double() <= self.tolerance
         fits = valid & good.any(-1)
         # inside one episode the first row within tolerance is the one with the most steps left
         first = good.int().argmax(-1, keepdim=True)
         left = torch.where(fits, left - first[..., 0], -1)
         fits &= left == left.amax(-1, keepdim=True)
-        value = torch.where(fits, window.gather(-1, first)[..., 0], -torch.inf)
+        value = torch.where(fits, returns.gather(-1, first)[..., 0], -torch.inf)
         fits &= value == value.amax(-1, keepdim=True)
         target = torch.where(fits, rows + first[..., 0], torch.iinfo(torch.int64).max)
         target = target.amin(-1, keepdim=True)
