@@ -350,25 +350,29 @@ def test_seeds_and_their_table(tmp_path):
         assert f"| 4 | {scores[0]:.1f}, {scores[1]:.1f} |" in line
 
 
-def test_a_failed_run_does_not_end_a_sweep(tmp_path):
-    """Of runs that joblib launches the second has nothing to do."""
-    pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
+@pytest.mark.parametrize("launcher", ["joblib", "submitit_local"])
+def test_a_failed_run_does_not_end_a_sweep(launcher, tmp_path):
+    """One of the runs that a launcher starts has nothing to do."""
+    pytest.importorskip(f"hydra_plugins.hydra_{launcher.removesuffix('_local')}_launcher")
+    one = ["hydra.launcher.n_jobs=1"] if launcher == "joblib" else []
     code, _, err = call(
-        "dl_rad.py", "--multirun", "hydra/launcher=joblib", "hydra.launcher.n_jobs=1", *SMALL,
+        "dl_rad.py", "--multirun", f"hydra/launcher={launcher}", *one, *SMALL,
         "~retrieval.followed", "optim.gradient_steps=2,0,1",
     )  # fmt: skip
     assert code == 1
     assert "steps is 0; expected 1 or more" in err
-    folders = sorted((tmp_path / "outputs" / "pointmaze-umaze").iterdir())
-    steps = [RunFolder.open(folder).config()["optim"]["gradient_steps"] for folder in folders]
-    assert steps == [2, 0, 1]
-    assert [(folder / "results.json").exists() for folder in folders] == [True, False, True]
-    code, table, err = call("merge.py", *map(str, folders))
+    runs = {
+        RunFolder.open(folder).config()["optim"]["gradient_steps"]: folder
+        for folder in (tmp_path / "outputs" / "pointmaze-umaze").iterdir()
+    }
+    done = {steps: (folder / "results.json").exists() for steps, folder in runs.items()}
+    assert done == {2: True, 0: False, 1: True}
+    code, table, err = call("merge.py", *map(str, runs.values()))
     assert code == 1
     assert len(table.splitlines()) == 4  # backbone and paper
-    assert err.splitlines()[1] == f"  {folders[1]}: error: steps is 0; expected 1 or more."
+    assert err.splitlines()[1] == f"  {runs[0]}: error: steps is 0; expected 1 or more."
     # gone on with, it is alive
-    assert_error(call("dl_rad.py", f"resume={folders[1]}"), "steps is 0")
+    assert_error(call("dl_rad.py", f"resume={runs[0]}"), "steps is 0")
 
 
 def test_runs_that_begin_in_one_second_get_folders_of_their_own(tmp_path, monkeypatch):
