@@ -1,3 +1,5 @@
+import copy
+
 import pytest
 import torch
 from hypothesis import given, settings
@@ -16,12 +18,30 @@ PLANNER = {
 ABOUT = {"state_dim": 3, "action_dim": 2, "planner": PLANNER, "target": None}
 
 
-def make_policy():
+DIFFUSER = {
+    "kind": "diffuser", "horizon": 8, "width": 8, "multiples": [1, 2], "steps": 1,
+    "return_model": None, "candidates": 1, "noise": "seeded",
+}  # fmt: skip
+planners = pytest.mark.parametrize("planner", [PLANNER, DIFFUSER], ids=["lite", "diffuser"])
+
+
+def make_policy(planner=PLANNER):
     torch.manual_seed(0)
-    policy = build_policy(ABOUT)
+    policy = build_policy({**ABOUT, "planner": planner})
     for parameter in policy[-1].networks.parameters():
         torch.nn.init.normal_(parameter, std=0.3)
     return policy
+
+
+def planned_actions(policy, state):
+    """All actions of the plan for one state [1, S], from the planner alone."""
+    planner = copy.copy(policy[-1])
+    told = TensorDict({"observation": state}, [1])
+    if planner.most_outputs == 3:
+        planner.out_keys = ["plan", "action", "actions"]
+        return planner(told)["actions"]
+    plan = planner(told)["plan"]
+    return planner.inverse_dynamics(plan[:, :-1], plan[:, 1:])
 
 
 def drive(policy, states, starts):
@@ -45,29 +65,30 @@ def test_actions_of_a_plan():
         torch.testing.assert_close(actions[:, step], inverse(plan[:, step], plan[:, step + 1]))
 
 
+@planners
 @settings(max_examples=20, deadline=None)
 @given(seed=st.integers(0, 1000), interval=st.integers(1, 4))
-def test_each_row_plans_on_its_own_clock(seed, interval):
-    policy = make_policy()
+def test_each_row_plans_on_its_own_clock(planner, seed, interval):
+    policy = make_policy(planner)
     generator = torch.Generator().manual_seed(seed)
     states = torch.randn(11, 3, 3, generator=generator)
     starts = torch.rand(11, 3, generator=generator) < 0.2
     starts[0] = True
     found = drive(with_replanning(policy, interval), states, starts)
-    inverse = policy[-1].inverse_dynamics
+    assert policy[-1].out_keys == ["plan", "action"]
     for row in range(3):
-        since, plan = 0, None
+        since, actions = 0, None
         for step in range(11):
             if starts[step, row] or since == interval:
-                told = TensorDict({"observation": states[step, row : row + 1]}, [1])
-                since, plan = 0, policy(told)["plan"]
-            expected = inverse(plan[:, since], plan[:, since + 1])[0]
+                since, actions = 0, planned_actions(policy, states[step, row : row + 1])
+            expected = actions[0, since]
             torch.testing.assert_close(found[step, row], expected, atol=1e-5, rtol=1e-4)
             since += 1
 
 
-def test_planning_at_each_step_is_the_policy():
-    policy, states = make_policy(), torch.randn(5, 2, 3)
+@planners
+def test_planning_at_each_step_is_the_policy(planner):
+    policy, states = make_policy(planner), torch.randn(5, 2, 3)
     starts = torch.zeros(5, 2, dtype=torch.bool)
     starts[0] = True
     found = drive(with_replanning(policy, 1), states, starts)
@@ -80,9 +101,16 @@ def test_plans_that_do_not_reach_so_far(interval):
         with_replanning(make_policy(), interval)
 
 
-def test_plans_of_a_diffuser():
-    diffuser = {"kind": "diffuser", "horizon": 8, "width": 8, "multiples": [1, 2],
-                "candidates": 1, "return_model": None}  # fmt: skip
-    policy = build_policy({**ABOUT, "planner": diffuser})
-    with pytest.raises(ValueError, match="plans of DiffuserPlanner are not acted on"):
-        with_replanning(policy, 2)
+def test_plans_of_a_diffuser_reach_their_horizon():
+    with pytest.raises(ValueError, match="interval is 9; expected 1 to 8, the steps of a plan"):
+        with_replanning(make_policy(DIFFUSER), 9)
+
+
+def test_all_actions_of_a_plan_on_demand():
+    planner = make_policy(DIFFUSER)[-1]
+    planner.out_keys = ["plan", "action", "actions"]
+    out = planner(TensorDict({"observation": torch.randn(2, 5, 3)}, [2, 5]))
+    assert out["actions"].shape == (2, 5, 8, 2) and out["actions"].abs().max() <= planner.bound
+    assert torch.equal(out["actions"][..., 0, :], out["action"])
+    with pytest.raises(ValueError, match="expected one and two, in the order of the table"):
+        build_policy({**ABOUT, "planner": {**PLANNER, "out_keys": ["plan", "action", "actions"]}})

@@ -50,6 +50,8 @@ class DiffuserPlanner(Planner):
     ``plan``          [*B, H, S] float32    planned states, raw units, at ``plan_times``
                                             (int64 [H]) steps from now
     ``action``        [*B, A] float32       action
+    ``actions``       [*B, H, A] float32,   all actions of the plan; the first one is ``action``
+                      on demand
     ================  ====================  ====================================================
 
     Args:
@@ -67,7 +69,8 @@ class DiffuserPlanner(Planner):
             to ``1``.
         return_model (NoisyReturnModel, optional): J; needed for more than one candidate.
         guide_scale (float, optional): times the posterior variance it is the factor of J's
-            gradient, J in units of its deviation; 0 for none. Defaults to ``1.0``.
+            gradient, J in units of its deviation (Diffuser's scales are of J in units of return:
+            times the deviation they are these); 0 for none. Defaults to ``1.0``.
         guide_steps (int, optional): gradients before a call of the network. Defaults to ``2``.
         guide_stop (int, optional): last steps that are not guided. Defaults to ``2``.
         noise (str, optional): ``"sample"``; ``"seeded"``: the same noise at each call and for each
@@ -76,7 +79,8 @@ class DiffuserPlanner(Planner):
         targets (bool, optional): False gives the backbone, which reads the observation alone.
             Defaults to ``True``.
         bound (float, optional): actions lie in [-bound, bound]. Defaults to ``1.0``.
-        in_keys, out_keys (sequence of NestedKey, optional): new names, in the order of the table.
+        in_keys, out_keys (sequence of NestedKey, optional): new names, in the order of the table; a
+            third out_key asks for all actions.
 
     Raises:
         ValueError: an argument has a value that it cannot have.
@@ -94,6 +98,7 @@ class DiffuserPlanner(Planner):
     plan_times: Tensor
     process: Diffusion
     return_model: NoisyReturnModel | None
+    most_outputs = 3
 
     def __init__(
         self,
@@ -154,14 +159,15 @@ class DiffuserPlanner(Planner):
         self.register_buffer("plan_times", torch.arange(horizon), persistent=False)
         self._frozen_returns = FrozenCache()
 
-    def decide(self, state: Tensor, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
+    def decide(self, state: Tensor, tensordict: TensorDictBase) -> tuple[Tensor, ...]:
         pin = None
         if self.targets:
             told = self._told(tensordict, len(state))
             place = self.placement(told.step, 0, *self.levels[0])
             pin = Pin(place.token, told.target, told.found & place.active)
         plan, width = self._planned(state, [pin]), state.shape[-1]
-        return plan[..., :width], plan[:, 0, width:].clamp(-self.bound, self.bound)
+        actions = plan[..., width:].clamp(-self.bound, self.bound)
+        return (plan[..., :width], actions[:, 0], actions)[: len(self.out_keys)]
 
     def plan(self, state: Tensor, pins: Sequence[Pin | None]) -> Tensor:
         (pin,), (rows, width) = pins, state.shape

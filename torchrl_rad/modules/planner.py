@@ -93,6 +93,7 @@ class Planner(TensorDictModuleBase):
 
     networks: PlanNetworks
     condition: ReturnCondition | None
+    most_outputs = 2
 
     def __init__(
         self,
@@ -112,10 +113,12 @@ class Planner(TensorDictModuleBase):
         read = ["observation", "target", "found", "target_step", "target_index"]
         self.in_keys = list(in_keys) if in_keys is not None else read if targets else read[:1]
         self.out_keys = list(out_keys)
-        if len(self.in_keys) not in ((4, 5) if targets else (1,)) or len(self.out_keys) != 2:
+        written = 2 <= len(self.out_keys) <= self.most_outputs
+        if len(self.in_keys) not in ((4, 5) if targets else (1,)) or not written:
             raise ValueError(
                 f"in_keys are {self.in_keys} and out_keys {self.out_keys}; expected "
-                f"{'five' if targets else 'one'} and two, in the order of the table."
+                f"{'five' if targets else 'one'} and two{' or three' * (self.most_outputs > 2)}, "
+                "in the order of the table."
             )
         self.process, self.steps, self.temperatures = process, steps, list(temperatures)
         self.candidates, self.noise, self.targets = candidates, noise, targets
@@ -124,8 +127,10 @@ class Planner(TensorDictModuleBase):
         self._frozen = FrozenCache()
         self._captured: CapturedPlan | None = None
 
-    def decide(self, state: Tensor, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
+    def decide(self, state: Tensor, tensordict: TensorDictBase) -> tuple[Tensor, ...]:
         """Plans [Q, L, S] and actions [Q, A] for raw states [Q, S]; targets are read from the rest.
+
+        What else is asked for by an ``out_key`` comes behind them.
 
         Args:
             state (Tensor): what ``tensordict`` holds, flat and finite.
@@ -140,9 +145,8 @@ class Planner(TensorDictModuleBase):
         observation = self.normalizer.read(tensordict, self.in_keys[0])
         shape, width = observation.shape[:-1], observation.shape[-1]
         state = torch.nan_to_num(observation, nan=0.0, posinf=0.0, neginf=0.0).reshape(-1, width)
-        plan, action = self.decide(state, tensordict)
-        tensordict.set(self.out_keys[0], plan.reshape(*shape, *plan.shape[1:]))
-        tensordict.set(self.out_keys[1], action.reshape(*shape, action.shape[-1]))
+        for key, value in zip(self.out_keys, self.decide(state, tensordict), strict=True):
+            tensordict.set(key, value.reshape(*shape, *value.shape[1:]))
         return tensordict
 
     def plan(self, state: Tensor, pins: Sequence[Pin | None]) -> Tensor:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Sequence
+from functools import partial
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModuleBase, TensorDictSequential
+from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
 from tensordict.utils import NestedKey
 from torchrl.modules import MultiStepActorWrapper
 
@@ -63,17 +65,19 @@ class PlanActions(TensorDictModuleBase):
 def with_replanning(policy: TensorDictSequential, interval: int) -> MultiStepActorWrapper:
     """The same policy, which plans at every ``interval``-th step of a row and acts on in between.
 
+    In between it takes the actions that a :class:`DiffuserPlanner` has planned, or those that lead
+    along the planned states of a :class:`DiffuserLitePlanner`.
+
     It is TorchRL's :class:`~torchrl.modules.MultiStepActorWrapper`: the environment needs
     :class:`~torchrl.envs.InitTracker`, and what is left of a plan lies in the tensordict. Between
     plans the policy looks neither at the state nor at the database.
 
     Args:
-        policy (TensorDictSequential): of :func:`build_policy`, with a
-            :class:`DiffuserLitePlanner`; its weights are shared.
+        policy (TensorDictSequential): of :func:`build_policy`; its weights are shared.
         interval (int): steps from plan to plan.
 
     Raises:
-        ValueError: the planner is another one, or its finest level does not reach so far.
+        ValueError: the plan, or its finest level, does not reach so far.
 
     Examples:
         >>> from torchrl_rad.policy import build_policy
@@ -83,22 +87,25 @@ def with_replanning(policy: TensorDictSequential, interval: int) -> MultiStepAct
         5
     """
     planner = policy[-1]
-    if not isinstance(planner, DiffuserLitePlanner):
-        raise ValueError(
-            f"plans of {type(planner).__name__} are not acted on for several steps; only those of "
-            "DiffuserLitePlanner are."
-        )
-    reach = planner.levels[-1].span
+    lite = isinstance(planner, DiffuserLitePlanner)
+    reach = planner.levels[-1].span if lite else planner.horizon
     if not 1 <= interval <= reach:
         raise ValueError(
-            f"interval is {interval}; expected 1 to {reach}, the steps of the plan's finest level."
+            f"interval is {interval}; expected 1 to {reach}, the steps of "
+            f"{'the finest level of ' * lite}a plan."
         )
-    chunk = PlanActions(planner.inverse_dynamics, interval, planner.out_keys[:1])
+    if lite:
+        chunk = PlanActions(planner.inverse_dynamics, interval, planner.out_keys[:1])
+    else:
+        planner = copy.copy(planner)
+        planner.out_keys = [*planner.out_keys[:2], "actions"]
+        first = partial(torch.narrow, dim=-2, start=0, length=interval)
+        chunk = TensorDictModule(first, planner.out_keys[2:], ["action_chunk"])
     return MultiStepActorWrapper(
-        TensorDictSequential(*policy, chunk),
+        TensorDictSequential(*list(policy)[:-1], planner, chunk),
         n_steps=interval,
         replan_interval=interval,
         chunk_keys=chunk.out_keys,
-        action_keys=planner.out_keys[1:],
+        action_keys=planner.out_keys[1:2],
         init_key="is_init",
     )
