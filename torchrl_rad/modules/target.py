@@ -86,8 +86,8 @@ class RetrievalTargetModule(TensorDictModuleBase):
     ==================  ========================  ==================================================
 
     Args:
-        database (ExpertDatabase or ShardedExpertDatabase): the demonstrations. Of a sharded one
-            ``goal_key`` holds some 30 bytes a row in memory.
+        database (ExpertDatabase or ShardedExpertDatabase): the demonstrations. Of a sharded one,
+            ``goal_key`` holds 16 bytes a row in memory, beside the entries compared with a goal.
         horizon (int, optional): H; a target is at most H - 1 recorded steps ahead. The planner's H,
             or less: the paper's rule does not count the way, so that with a large one it leaves
             what pays for what pays later. Defaults to ``129``.

@@ -154,8 +154,8 @@ class GoalTable:
 
     Args:
         tables (sequence of TensorDictBase): content of a database, [N] in all, each of whole
-            episodes. Of each of its N rows some 30 bytes are held, beside the entries of a state
-            that are compared with a goal.
+            episodes. Of each of its N rows 16 bytes are held, beside the entries of a state that
+            are compared with a goal.
         key (NestedKey): the state in it.
         gamma (float): discount of the returns.
         reward (GoalReward): when a goal is reached.
