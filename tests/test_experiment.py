@@ -287,8 +287,8 @@ def test_a_policy_plans_in_its_own_way_with_the_same_weights(data):
     share_weights(policies, "paper")
     paper, followed = (policies[name].policy[-1] for name in ("paper", "followed"))
     assert paper.condition.shares == (0.9, 0.9) and followed.condition.shares == (0.9, 0.2)
-    assert followed.condition.wanted()[0] == paper.condition.wanted()[0]
-    assert followed.condition.wanted()[1] < paper.condition.wanted()[1]
+    assert followed.condition.wanted[0] == paper.condition.wanted[0]
+    assert followed.condition.wanted[1] < paper.condition.wanted[1]
     assert (paper.steps, followed.steps) == (1, 2)
     state = followed.state_dict()
     assert all(torch.equal(value, state[key]) for key, value in paper.state_dict().items())

@@ -9,13 +9,7 @@ from hypothesis import strategies as st
 from tensordict import TensorDict
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from torchrl_rad import (
-    DenoisingLoss,
-    DiffuserLitePlanner,
-    InverseDynamics,
-    Normalizer,
-    ReturnModel,
-)
+from torchrl_rad import DenoisingLoss, DiffuserLitePlanner, InverseDynamics, Normalizer
 from torchrl_rad.modules.condition import ReturnCondition
 from torchrl_rad.modules.dit import DiT
 from torchrl_rad.modules.frozen import FrozenDiT, PlainNetwork
@@ -35,11 +29,11 @@ def make_planner(condition=0.5, **options):
     return planner
 
 
-def plan(planner, found=(False, False, False)):
+def plan(planner):
     rows = {
         "observation": torch.ones(3, 2),
         "target": torch.zeros(3, 2),
-        "found": torch.tensor(found)[:, None],
+        "found": torch.zeros(3, 1, dtype=torch.bool),
         "target_step": torch.ones(3, 1, dtype=torch.int64),
         "target_index": torch.full((3, 1), -1),
     }
@@ -52,7 +46,7 @@ def plan(planner, found=(False, False, False)):
 @given(st.lists(st.floats(-100, 100, width=32), min_size=1), st.floats(0, 1))
 def test_the_wanted_return_is_one_of_the_recorded(returns, share):
     condition = ReturnCondition([share]).fit(torch.tensor(returns))
-    wanted = float(condition.wanted())
+    wanted = float(condition.wanted)
     assert wanted in returns
     below = sum(value < wanted for value in returns) / len(returns)
     above = sum(value > wanted for value in returns) / len(returns)
@@ -61,7 +55,7 @@ def test_the_wanted_return_is_one_of_the_recorded(returns, share):
 
 def test_values_by_hand():
     condition = ReturnCondition([0.75]).fit(torch.tensor([[0.0], [4.0], [0.0], [4.0], [2.0]]))
-    assert float(condition.wanted()) == 4.0  # the fourth of five
+    assert float(condition.wanted) == 4.0  # the fourth of five
     assert float(condition.mean) == 2.0
     assert float(condition.deviation) == pytest.approx(3.2**0.5)
     assert condition(torch.tensor([2.0, 2.0 + 3.2**0.5])).tolist() == pytest.approx([0.0, 1.0])
@@ -69,15 +63,13 @@ def test_values_by_hand():
 
 def test_equal_returns_have_a_scale():
     condition = ReturnCondition([0.9, 0.1]).fit(torch.ones(4))
-    assert condition(condition.wanted()).tolist() == [0.0, 0.0]
+    assert condition().tolist() == [0.0, 0.0]
 
 
 @pytest.mark.parametrize("share", [-0.1, 1.1, float("nan")])
 def test_a_share_that_is_none(share):
     with pytest.raises(ValueError, match="share of returns below the wanted one is"):
         ReturnCondition([0.5, share])
-    with pytest.raises(ValueError, match="share of returns below the wanted one is"):
-        ReturnCondition([0.5, 0.5], [share, 0.5])
 
 
 @pytest.mark.parametrize("returns", [[], [1.0, float("nan")], [float("inf")]])
@@ -126,17 +118,17 @@ def test_plans_depend_on_the_wanted_return_also_after_the_first():
     planner = make_planner()
     planner.condition.fit(torch.arange(5.0))
     before = plan(planner)
-    planner.condition.without = (1.0, 1.0)
+    planner.condition.shares = (1.0, 1.0)
     after = plan(planner)
     assert (after - before).abs().max() > 0.01
-    planner.condition.without = (0.5, 0.5)
+    planner.condition.shares = (0.5, 0.5)
     assert torch.allclose(plan(planner), before)
 
 
 def test_levels_are_told_returns_of_their_own():
     planner = make_planner([0.5, 1.0])
     planner.condition.fit(torch.arange(5.0))
-    assert planner.condition.wanted().tolist() == [2.0, 4.0]
+    assert planner.condition.wanted.tolist() == [2.0, 4.0]
     own, high = plan(planner), plan(make_planner_like(planner, 1.0))
     low = plan(make_planner_like(planner, 0.5))
     first = planner.plan_times % JUMPS[0] == 0
@@ -145,38 +137,8 @@ def test_levels_are_told_returns_of_their_own():
     assert (own - high)[:, first].abs().max() > 0.01
 
 
-@pytest.mark.parametrize("candidates", [1, 3])
-def test_rows_without_a_target_are_told_another_return(candidates):
-    states, options = Normalizer.identity(2), {"noise": "seeded", "candidates": candidates}
-    torch.manual_seed(1)
-    options["return_model"] = ReturnModel(states, tokens=3, width=8)
-    planner = make_planner([0.5, 1.0], condition_without_target=0.0, **options)
-    planner.condition.fit(torch.arange(5.0))
-    mixed = plan(planner, (True, False, True))
-    targeted = plan(make_planner_like(planner, [0.5, 1.0], **options), (True, True, True))
-    alone = plan(make_planner_like(planner, 0.0, **options))
-    assert torch.allclose(mixed, torch.stack([targeted[0], alone[1], targeted[2]]), atol=1e-5)
-    assert torch.allclose(plan(planner), alone, atol=1e-5)
-    assert (plan(make_planner_like(planner, [0.5, 1.0], **options)) - alone).abs().max() > 0.01
-
-
-def test_a_backbone_has_no_target():
-    planner = make_planner(1.0, condition_without_target=[0.0, 0.5], targets=False)
-    planner.condition.fit(torch.arange(5.0))
-    rows = TensorDict({"observation": torch.ones(3, 2)}, [3])
-    other = make_planner_like(planner, [0.0, 0.5], targets=False)
-    assert torch.equal(planner(rows.copy())["plan"], other(rows)["plan"])
-
-
-def test_no_return_without_a_target_alone():
-    with pytest.raises(ValueError, match="condition_without_target is given without a condition"):
-        make_planner(None, condition_without_target=0.5)
-    with pytest.raises(ValueError, match=r"condition_without_target is \[0.5\]; .* the 2 levels"):
-        make_planner(0.5, condition_without_target=[0.5])
-
-
-def make_planner_like(planner, condition, **options):
-    other = make_planner(condition, **options)
+def make_planner_like(planner, condition):
+    other = make_planner(condition)
     other.load_state_dict(planner.state_dict())
     return other
 
@@ -282,13 +244,13 @@ def data():
 def test_the_wanted_return_is_fitted_and_saved(tmp_path):
     policy = build_policy(DESCRIPTION)
     fit_scales(policy, data())
-    assert policy[-1].condition.wanted().tolist() == [35.0, 35.0]  # round(0.9 x 39)
+    assert policy[-1].condition.wanted.tolist() == [35.0, 35.0]  # round(0.9 x 39)
     save_policy(tmp_path / "policy", policy, DESCRIPTION)
     again = load_policy(tmp_path / "policy")
     state = TensorDict({"observation": torch.randn(2, 2)}, [2])
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         assert torch.equal(policy(state.clone())["plan"], again(state.clone())["plan"])
-    assert again[-1].condition.wanted().tolist() == [35.0, 35.0]
+    assert again[-1].condition.wanted.tolist() == [35.0, 35.0]
 
 
 def test_it_has_no_other_goals():

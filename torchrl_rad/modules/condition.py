@@ -26,31 +26,30 @@ class ReturnCondition(nn.Module):
     Args:
         shares (sequence of float): of the recorded returns that lie below the one wanted, in
             [0, 1], one for each level; can be set anew.
-        without (sequence of float, optional): the same for plans without a target. Defaults to
-            ``shares``.
 
     Raises:
         ValueError: a share lies outside [0, 1].
 
     Examples:
         >>> condition = ReturnCondition([1.0, 0.0]).fit(torch.tensor([1.0, 3.0, 5.0, 7.0]))
-        >>> condition.wanted().tolist(), condition(torch.tensor([4.0])).tolist()
+        >>> condition.wanted.tolist(), condition(torch.tensor([4.0])).tolist()
         ([7.0, 1.0], [0.0])
+        >>> bool(condition()[0] == condition(torch.tensor([7.0])))
+        True
     """
 
     mean: Tensor
     deviation: Tensor
     quantiles: Tensor
 
-    def __init__(self, shares: Sequence[float], without: Sequence[float] | None = None):
+    def __init__(self, shares: Sequence[float]):
         super().__init__()
-        self.shares = tuple(shares)
-        self.without = self.shares if without is None else tuple(without)
-        wrong = [share for share in self.shares + self.without if not 0.0 <= share <= 1.0]
+        wrong = [share for share in shares if not 0.0 <= share <= 1.0]
         if wrong:
             raise ValueError(
                 f"the share of returns below the wanted one is {wrong[0]}; use 0 to 1."
             )
+        self.shares = tuple(shares)
         self.register_buffer("mean", torch.zeros(()))
         self.register_buffer("deviation", torch.ones(()))
         self.register_buffer("quantiles", torch.zeros(QUANTILES))
@@ -69,11 +68,12 @@ class ReturnCondition(nn.Module):
         self.deviation.fill_(max(float(ordered.double().std(correction=0)), 1e-6))
         return self
 
-    def wanted(self, target: bool = True) -> Tensor:
-        """The returns asked for, [L], of plans with a target or without one."""
-        shares = self.shares if target else self.without
-        return torch.stack([self.quantiles[round(share * (QUANTILES - 1))] for share in shares])
+    @property
+    def wanted(self) -> Tensor:
+        """The returns asked for, [L]."""
+        return torch.stack([self.quantiles[round(s * (QUANTILES - 1))] for s in self.shares])
 
-    def forward(self, returns: Tensor) -> Tensor:
-        """What networks are told of returns [B]."""
+    def forward(self, returns: Tensor | None = None) -> Tensor:
+        """What networks are told: of returns [B], or of those wanted, one a level."""
+        returns = self.wanted if returns is None else returns
         return (returns - self.mean) / self.deviation

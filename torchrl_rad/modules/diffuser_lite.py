@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from torchrl_rad.data.database import ExpertDatabase
 from torchrl_rad.modules.condition import ReturnCondition
 from torchrl_rad.modules.dit import DiT
-from torchrl_rad.modules.frozen import EitherNetwork, StepNetwork
+from torchrl_rad.modules.frozen import StepNetwork
 from torchrl_rad.modules.inverse import InverseDynamics
 from torchrl_rad.modules.levels import (
     change_of,
@@ -86,8 +86,6 @@ class DiffuserLitePlanner(Planner):
             plan is to have, here one that this share of the recorded ones lies below, the same for
             all levels or one for each (see :class:`ReturnCondition`). Defaults to none: they are
             told nothing.
-        condition_without_target (float or sequence of float, optional): the same for rows without a
-            target. Levels where it differs are computed both ways. Defaults to ``condition``.
         in_keys, out_keys (sequence of NestedKey, optional): new names, in the order of the table.
 
     Raises:
@@ -127,7 +125,6 @@ class DiffuserLitePlanner(Planner):
         database: ExpertDatabase | None = None,
         relative: bool = False,
         condition: float | Sequence[float] | None = None,
-        condition_without_target: float | Sequence[float] | None = None,
         in_keys: Sequence[NestedKey] | None = None,
         out_keys: Sequence[NestedKey] = ("plan", "action"),
     ):
@@ -158,12 +155,7 @@ class DiffuserLitePlanner(Planner):
         state_dim = len(normalizer.mean)
         conditioned = condition is not None
         if condition is not None:
-            without = condition if condition_without_target is None else condition_without_target
-            shares = _one_a_level("condition", condition, len(levels))
-            name = "condition_without_target"
-            self.condition = ReturnCondition(shares, _one_a_level(name, without, len(levels)))
-        elif condition_without_target is not None:
-            raise ValueError("condition_without_target is given without a condition; pass both.")
+            self.condition = ReturnCondition(_one_a_level("condition", condition, len(levels)))
         self.networks = PlanNetworks(
             DiT(state_dim, level.tokens, width, heads, blocks, conditioned=conditioned)
             for level in self.levels
@@ -209,7 +201,7 @@ class DiffuserLitePlanner(Planner):
 
     def plan(self, state: Tensor, pins: Sequence[Pin | None]) -> Tensor:
         seeded = self._generator(state.device)
-        networks = self._told_networks(state.device, pins)
+        networks = self._step_networks(state.device)
         end: Tensor | None = None
         finished: list[Tensor] = []
         with torch.autocast(state.device.type, enabled=False):
@@ -219,27 +211,6 @@ class DiffuserLitePlanner(Planner):
                 finished = [states, *(part[:, 2:] for part in finished[:1]), *finished[1:]]
                 end = states[:, 1]
         return torch.cat(finished, 1)
-
-    def _told_networks(self, device: torch.device, pins: Sequence[Pin | None]) -> list[StepNetwork]:
-        """The networks, each told the return that a row's plan is to have."""
-        told = self.condition
-        if told is None:
-            return self._step_networks(device)
-        active = [pin.active for pin in pins if pin is not None]
-        if not active or told.shares == told.without:
-            return self._step_networks(device, told(told.wanted(target=bool(active))))
-        found = torch.stack(active).any(0)
-        pairs = zip(
-            told.shares,
-            told.without,
-            self._step_networks(device, told(told.wanted())),
-            self._step_networks(device, told(told.wanted(target=False))),
-            strict=True,
-        )
-        return [
-            with_target if share == other else EitherNetwork(found, with_target, without)
-            for share, other, with_target, without in pairs
-        ]
 
     def _level(
         self,

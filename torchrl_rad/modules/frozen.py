@@ -12,7 +12,6 @@ from torch import Tensor, nn
 from torchrl_rad.modules.dit import Block, DiT
 
 __all__ = [
-    "EitherNetwork",
     "FrozenCache",
     "FrozenDiT",
     "FrozenLinear",
@@ -93,26 +92,6 @@ class PlainNetwork:
         with torch.autocast(x.device.type, self.dtype, self.dtype is not None):
             time = torch.full((1,), self.times[step], device=x.device)
             return self.network(x, prepared, time, **self.told)[:, free].to(x.dtype)
-
-
-class EitherNetwork:
-    """One of two networks for each row; both are called on all of them.
-
-    Args:
-        rows (Tensor): bool [Q], those of the first one; each stands for as many plans.
-        first, second (StepNetwork): of the same weights, told different things.
-    """
-
-    def __init__(self, rows: Tensor, first: StepNetwork, second: StepNetwork):
-        self.rows, self.first, self.second = rows, first, second
-
-    def prepare(self, mask: Tensor) -> Tensor:
-        return self.first.prepare(mask)
-
-    def __call__(self, x: Tensor, prepared: Tensor, step: int, free: slice) -> Tensor:
-        rows = self.rows.repeat_interleave(len(x) // max(1, len(self.rows)))[:, None, None]
-        first, second = (net(x, prepared, step, free) for net in (self.first, self.second))
-        return torch.where(rows, first, second)
 
 
 class FrozenLinear:

@@ -187,18 +187,13 @@ class Planner(TensorDictModuleBase):
         row = None if row is None else row.reshape(rows)
         return Told(target, found.reshape(rows), step.reshape(rows), row)
 
-    def _step_networks(
-        self, device: torch.device, wanted: Tensor | None = None
-    ) -> list[StepNetwork]:
-        """The networks of the levels at the sampler's times; under autocast in its precision.
-
-        Args:
-            device (torch.device): of the networks.
-            wanted (Tensor, optional): [L], what each is told.
-        """
+    def _step_networks(self, device: torch.device) -> list[StepNetwork]:
+        """The networks of the levels at the sampler's times; under autocast in its precision."""
         lower = torch.is_autocast_enabled(device.type)
         dtype = torch.get_autocast_dtype(device.type) if lower else None
         times = self.process.grid(self.steps)[:-1]
+
+        wanted = None if self.condition is None else self.condition()  # [L]
 
         def make() -> list[StepNetwork]:
             each = [None] * len(self.networks) if wanted is None else wanted.split(1)
