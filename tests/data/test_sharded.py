@@ -524,11 +524,10 @@ def test_shards_in_several_processes(tmp_path):
 
 def test_shards_in_ray_actors(ray, tmp_path, monkeypatch):
     _, many, states = assert_workers_serve("ray", tmp_path / "many")
-    monkeypatch.setattr(ray, "kill", lambda actor: pytest.fail("Ray has ended"))
     with monkeypatch.context() as ended:
+        ended.setattr(ray, "kill", lambda actor: pytest.fail("Ray has ended"))
         ended.setattr(ray, "is_initialized", lambda: False)
         many.sampler.homes[0].close()
-    monkeypatch.undo()
     assert_a_hidden_shard_is_named(many, states)
 
 

@@ -44,7 +44,8 @@ class ShardSampler(RetrievalSampler):
         self.homes: list[Home] | None = None
         self.tail_home: Home | None = None
         self.told = 0  # how many shards the homes have
-        self.stale = True  # the scale
+        self.stale = True  # the scale that the homes have
+        self._moments: tuple[np.ndarray, np.ndarray] | None = None  # of all rows
 
     def hold(
         self,
@@ -56,7 +57,7 @@ class ShardSampler(RetrievalSampler):
         if tail is not self.tail:
             self.tail_home = None
         self.shards, self.opened, self.tail = shards, opened, tail
-        self.stale, self._scale = True, None
+        self.stale, self._scale, self._moments = True, None, None
 
     def nearest(
         self, storage: Any, query: Tensor, k: int | None = None, among: SearchIndex | None = None
@@ -68,7 +69,7 @@ class ShardSampler(RetrievalSampler):
         if k == 0:
             rows = torch.full((len(query), 0), -1)
             return rows, torch.empty(len(query), 0, dtype=torch.float64)
-        width = storage.tables[0].get(self.key).shape[-1]
+        width = self._states_width(storage)
         self._check_query(query, width)
         self._check_dims(width)
         asked = query.detach().to("cpu", torch.float64).numpy()
@@ -96,22 +97,25 @@ class ShardSampler(RetrievalSampler):
 
     def compared(self, storage: Any) -> int:
         """As :meth:`RetrievalSampler.compared`."""
-        states = storage.tables[0].get(self.key)
-        return states.shape[-1] if self.dims is None else len(self.dims)
+        return self._states_width(storage) if self.dims is None else len(self.dims)
 
     def subset(self, storage: Any, rows: Tensor) -> SearchIndex:
         """As :meth:`RetrievalSampler.subset`; it is here, in memory, whatever the workers."""
+        self._fit(storage)
         states = storage.column(self.key).index_select(0, rows)
-        self._fit(states.shape[-1])
         return build_index(self._prepare(states), self.metric, "auto", self.k)
 
     def _ready(self, storage: Any, query: Tensor) -> tuple[Any, Tensor, Tensor | None]:
-        self._fit(storage.tables[0].get(self.key).shape[-1])
+        self._fit(storage)
         return None, *self._asked(query, "cpu")
 
-    def _fit(self, width: int) -> None:
-        self._check_dims(width)
-        self._width = width
+    def _states_width(self, storage: Any) -> int:
+        return storage.tables[0].get(self.key).shape[-1]
+
+    def _fit(self, storage: Any) -> None:
+        """Takes width and scale of the rows as they are now, for a search that is made here."""
+        self._width = self._states_width(storage)
+        self._check_dims(self._width)
         if self.normalize and self._scale is None:
             mean, deviation = map(torch.from_numpy, self._scale_of_all())
             dims = slice(None) if self.dims is None else self.dims
@@ -165,6 +169,8 @@ class ShardSampler(RetrievalSampler):
         return self.tail_home
 
     def _scale_of_all(self) -> tuple[np.ndarray, np.ndarray]:
+        if self._moments is not None:
+            return self._moments
         names = ("mean", "spread", "low", "high")
         parts = []
         for shard in self.shards:
@@ -174,4 +180,5 @@ class ShardSampler(RetrievalSampler):
             states = self.tail.storage[:].get(self.key)
             parts.append((len(states), moments(states)))
         mean, deviation = scale_of(parts)  # type: ignore[arg-type]
-        return mean.numpy(), deviation.numpy()
+        self._moments = mean.numpy(), deviation.numpy()
+        return self._moments

@@ -90,10 +90,8 @@ def with_replanning(policy: TensorDictSequential, interval: int) -> MultiStepAct
     lite = isinstance(planner, DiffuserLitePlanner)
     reach = planner.levels[-1].span if lite else planner.horizon
     if not 1 <= interval <= reach:
-        raise ValueError(
-            f"interval is {interval}; expected 1 to {reach}, the steps of "
-            f"{'the finest level of ' * lite}a plan."
-        )
+        of = "the plan's finest level" if lite else "a plan"
+        raise ValueError(f"interval is {interval}; expected 1 to {reach}, the steps of {of}.")
     if lite:
         chunk = PlanActions(planner.inverse_dynamics, interval, planner.out_keys[:1])
     else:

@@ -277,14 +277,13 @@ class GoalTable:
         if self.experts is None or not reaches.any():
             return reaches
         asked = reaches[self.episode]
-        kept, end, lengths = [], 0, self.lengths[reaches]
+        kept, end = [], 0
         for table in self.tables:
             rows = slice(end, end := end + len(table))
             steps = table.copy().set(("next", "reward"), near[rows].float()[:, None])[asked[rows]]
-            count = int((steps["step"] == 0).sum())
-            if count:
-                kept.append(self.experts(steps.split(lengths[:count].tolist())))
-                lengths = lengths[count:]
+            lengths = (steps["remaining"][steps["step"] == 0] + 1).tolist()
+            if lengths:
+                kept.append(self.experts(steps.split(lengths)))
         return reaches.masked_scatter(reaches, torch.cat(kept).to(reaches.device))
 
 

@@ -83,14 +83,11 @@ class RankedRule(NamedTuple):
         return self.values.index_select(0, rows)
 
 
-class Ranks(Protocol):
+class Ranks(TargetRule, Protocol):
     """A rule by which the neighbours of a query can be put in order."""
 
     def ranked(self, rows: Tensor) -> tuple[Tensor, Tensor]:
         """For neighbours [Q, k] the row to go for through each, and its rank, not negative."""
-
-    def value(self, rows: Tensor, goals: Tensor | None = None) -> Tensor:
-        """As :meth:`TargetRule.value`."""
 
 
 class NoisyRule(NamedTuple):
@@ -129,7 +126,7 @@ class NoisyRule(NamedTuple):
 
     def value(self, rows: Tensor, goals: Tensor | None = None) -> Tensor:
         """As :meth:`TargetRule.value`."""
-        return self.rule.value(rows)
+        return self.rule.value(rows, goals)
 
 
 class TolerantRule:

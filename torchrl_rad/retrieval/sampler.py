@@ -234,6 +234,7 @@ class RetrievalSampler(Sampler):
         return index, *self._asked(query, index.rows.device)
 
     def _asked(self, query: Tensor, device: Any) -> tuple[Tensor, Tensor | None]:
+        """Queries as a search structure wants them, and which are finite if not all are."""
         self._check_query(query, self._width)
         query = query.detach().to(device, torch.float64)
         finite = query.isfinite().all(-1, keepdim=True)
