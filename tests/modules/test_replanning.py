@@ -5,11 +5,15 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from tensordict import TensorDict
+from torchrl.data import LazyTensorStorage
 
+from torchrl_rad import ExpertDatabase, RetrievalSampler
 from torchrl_rad.modules.inverse import InverseDynamics
 from torchrl_rad.modules.normalizer import Normalizer
 from torchrl_rad.modules.replanning import PlanActions, with_replanning
 from torchrl_rad.policy import build_policy
+
+from ..walks import episodes
 
 PLANNER = {
     "horizon": 9, "jumps": [4, 1], "width": 16, "heads": 2, "blocks": 1, "steps": 1,
@@ -93,6 +97,39 @@ def test_planning_at_each_step_is_the_policy(planner):
     starts[0] = True
     found = drive(with_replanning(policy, 1), states, starts)
     torch.testing.assert_close(found, drive(policy, states, starts))
+
+
+@pytest.fixture
+def database():
+    """Two episodes of 20 steps along the first entry of the state."""
+    steps = torch.arange(40)
+    state = torch.stack([steps % 20, steps // 20, torch.zeros(40)], -1).float()
+    sampler = RetrievalSampler("euclidean", k=4, threshold=0.1)
+    database = ExpertDatabase(LazyTensorStorage(40), sampler=sampler)
+    database.extend(episodes(state, [20, 20], rewards=(steps % 20 == 19).float()))
+    return database
+
+
+@planners
+def test_what_was_retrieved_for_a_plan_is_written_as_long_as_it_lasts(planner, database):
+    about = {"rule": "highest", "horizon": 4}
+    torch.manual_seed(0)
+    settings = {**ABOUT, "planner": planner, "target": about, "estimator": {"width": 8}}
+    policy = build_policy(settings, database)
+    states = torch.stack([torch.arange(6.0), torch.zeros(6), torch.zeros(6)], -1)
+    states = torch.stack([states, states + 7.0], 1)  # [T, B, S]
+    states[2:4, 0] = 1e6  # no neighbour there
+    expected = torch.stack([policy(TensorDict({"observation": s}, [2])) for s in states])
+    assert [bool(expected[step]["found"][0]) for step in (0, 3)] == [True, False]
+    acting, td, found = with_replanning(policy, 3), TensorDict({}, [2]), []
+    for step, state in enumerate(states):
+        td["observation"], td["is_init"] = state, torch.full((2, 1), step == 0)
+        td = acting(td)
+        found.append(td.clone())
+    for step in range(6):
+        for key in (*policy[0].out_keys, *policy[1].out_keys):
+            told = expected[step - step % 3][key]
+            torch.testing.assert_close(found[step][key], told, equal_nan=True, rtol=0, atol=0)
 
 
 @pytest.mark.parametrize("interval", [0, -1, 5])

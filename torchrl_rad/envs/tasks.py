@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -43,5 +44,10 @@ def make_task(settings: Mapping[str, Any]) -> Task:
     family = rest.pop("family", None)
     if family not in FAMILIES:
         raise KeyError(f"unknown family of tasks {family!r}; known families are {list(FAMILIES)}.")
+    makes = FAMILIES[family]
+    takes = list(inspect.signature(makes).parameters)
+    if not rest.keys() <= set(takes):
+        wrong = [f"env.{key}" for key in rest if key not in takes]
+        raise TypeError(f"tasks of the family {family!r} take {takes} in env; leave out {wrong}.")
     lists = {key: tuple(value) for key, value in rest.items() if isinstance(value, list)}
-    return FAMILIES[family](**{**rest, **lists})
+    return makes(**{**rest, **lists})

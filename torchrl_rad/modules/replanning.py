@@ -10,6 +10,7 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
 from tensordict.utils import NestedKey
+from torch import Tensor
 from torchrl.modules import MultiStepActorWrapper
 
 from torchrl_rad.modules.diffuser_lite import DiffuserLitePlanner
@@ -70,7 +71,8 @@ def with_replanning(policy: TensorDictSequential, interval: int) -> MultiStepAct
 
     It is TorchRL's :class:`~torchrl.modules.MultiStepActorWrapper`: the environment needs
     :class:`~torchrl.envs.InitTracker`, and what is left of a plan lies in the tensordict. Between
-    plans the policy looks neither at the state nor at the database.
+    plans the policy looks neither at the state nor at the database; what TS and SE wrote for a plan
+    stays written as long as it is acted on.
 
     Args:
         policy (TensorDictSequential): of :func:`build_policy`; its weights are shared.
@@ -99,11 +101,21 @@ def with_replanning(policy: TensorDictSequential, interval: int) -> MultiStepAct
         planner.out_keys = [*planner.out_keys[:2], "actions"]
         first = partial(torch.narrow, dim=-2, start=0, length=interval)
         chunk = TensorDictModule(first, planner.out_keys[2:], ["action_chunk"])
+    told = [key for module in policy[:-1] for key in module.out_keys if isinstance(key, str)]
+    held = [f"{key}_chunk" for key in told]
+    modules = [*policy[:-1], planner, chunk]
+    if told:  # the wrapper carries chunks alone from step to step
+        modules.append(TensorDictModule(partial(_repeat, interval), told, held))
     return MultiStepActorWrapper(
-        TensorDictSequential(*list(policy)[:-1], planner, chunk),
+        TensorDictSequential(*modules),
         n_steps=interval,
         replan_interval=interval,
-        chunk_keys=chunk.out_keys,
-        action_keys=planner.out_keys[1:2],
+        chunk_keys=[*chunk.out_keys, *held],
+        action_keys=[*planner.out_keys[1:2], *told],
         init_key="is_init",
     )
+
+
+def _repeat(times: int, *values: Tensor) -> tuple[Tensor, ...]:
+    """Each value [N, ...] for every step of a plan, [N, times, ...]."""
+    return tuple(value[:, None].expand(-1, times, *value.shape[1:]) for value in values)
