@@ -89,8 +89,8 @@ def test_scores(settings, low, high):
         ({"name": "x", "maze": "umaze"}, KeyError, "unknown family of tasks None"),
         ({**HOPPER, "env_id": "Ant-v5"}, KeyError, "no reference returns for 'Ant-v5'"),
         ({**POINT, "maze": "moon"}, KeyError, "unknown maze 'moon'"),
-        ({**HOPPER, "goal": 1}, TypeError, r"family 'locomotion' take .*leave out \['env.goal'\]"),
-        ({**POINT, "max_steps": 9}, TypeError, r"take \['name', 'maze'\].*\['env.max_steps'\]"),
+        ({**HOPPER, "goal": 1}, ValueError, r"family 'locomotion' take .*leave out \['env.goal'\]"),
+        ({**POINT, "max_steps": 9}, ValueError, r"take \['name', 'maze'\].*\['env.max_steps'\]"),
     ],
 )
 def test_tasks_that_are_none(settings, error, message):

@@ -34,7 +34,7 @@ def make_task(settings: Mapping[str, Any]) -> Task:
 
     Raises:
         KeyError: the family or the maze is not known.
-        TypeError: the family's task takes other arguments.
+        ValueError: the family's task takes other arguments.
 
     Examples:
         >>> make_task({"name": "hopper-medium", "family": "locomotion", "env_id": "Hopper-v5"})
@@ -48,6 +48,6 @@ def make_task(settings: Mapping[str, Any]) -> Task:
     takes = list(inspect.signature(makes).parameters)
     if not rest.keys() <= set(takes):
         wrong = [f"env.{key}" for key in rest if key not in takes]
-        raise TypeError(f"tasks of the family {family!r} take {takes} in env; leave out {wrong}.")
+        raise ValueError(f"tasks of the family {family!r} take {takes} in env; leave out {wrong}.")
     lists = {key: tuple(value) for key, value in rest.items() if isinstance(value, list)}
     return makes(**{**rest, **lists})
