@@ -8,6 +8,7 @@ step 4 t + p of a sequence is at [p, t], so that the four outputs are whole bloc
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import lru_cache
 from typing import Any, cast
 
 import torch
@@ -26,6 +27,12 @@ from torchrl_rad.modules.temporal_unet import (
 __all__ = ["FrozenReturnModel", "FrozenUNet", "can_tile"]
 
 EPSILON = 1e-5  # of GroupNorm
+
+
+@lru_cache
+def _number(value: float, dtype: torch.dtype) -> Tensor:
+    """A 0-dim tensor: torch makes one of a Python number at each call, which takes microseconds."""
+    return torch.tensor(value, dtype=dtype)
 
 
 def can_tile(length: int, resolutions: int) -> bool:
@@ -77,10 +84,10 @@ class FrozenConv:
         if tiles == 1:  # the steps around are padding
             inputs, matrix = x.flatten(1), self.inputs[:, 2:6]
         else:
-            around = x.new_zeros(8, tiles, rows, entries)
+            around = x.new_empty(8, tiles, rows, entries)
             around[2:6] = x
-            around[:2, 1:] = x[2:, :-1]
-            around[6:, :-1] = x[:2, 1:]
+            around[:2, 1:], around[6:, :-1] = x[2:, :-1], x[:2, 1:]
+            around[:2, 0], around[6:, -1] = 0.0, 0.0  # padding
             inputs, matrix = around.flatten(1), self.inputs
         products = torch.bmm((matrix @ inputs).view(8, tiles * rows, entries), self.weight)
         y = (self.outputs @ products.flatten(1)).view(4, tiles, rows, products.shape[-1])
@@ -95,7 +102,6 @@ class FrozenConvBlock:
         weight, bias = conv.weight.detach(), cast(Tensor, conv.bias).detach()
         self.conv = FrozenConv(weight, bias)
         self.gamma, self.beta = norm.weight.detach(), norm.bias.detach()
-        self.one = torch.ones((), dtype=weight.dtype)
         if gradients:
             self.back = FrozenConv(weight.flip(-1).transpose(0, 1))
 
@@ -103,29 +109,34 @@ class FrozenConvBlock:
         x = self.conv(x)
         shape, grouped = x.shape, _grouped(x.shape)
         x = x.flatten(0, 1)  # [L, B, C]
-        count = len(x) * grouped[-1]
-        mean = x.sum(0).view(grouped).sum(-1, keepdim=True) / count  # [B, groups, 1]
-        square = (x * x).sum(0).view(grouped).sum(-1, keepdim=True) / count
-        rate = (square - mean * mean).clamp_min_(0.0).add_(EPSILON).rsqrt_()
+        one = _number(1.0, x.dtype)
+        share = _number(1 / (len(x) * grouped[-1]), x.dtype)  # of a group, of one entry
+        sums = torch.stack([x.sum(0), (x * x).sum(0)]).view(2, *grouped).sum(-1, keepdim=True)
+        mean, square = (sums * share).unbind(0)  # [B, groups, 1]
+        variance = torch.addcmul(square, mean, mean, value=-1).clamp_min_(0.0)
+        rate = variance.add_(_number(EPSILON, x.dtype)).rsqrt_()
         scale = rate * self.gamma.view(GROUPS, -1)  # [B, groups, C / groups]
-        shift = self.beta.view(GROUPS, -1) - mean * scale
+        shift = torch.addcmul(self.beta.view(GROUPS, -1), mean, scale, value=-1)
         scale, shift = scale.flatten(1), shift.flatten(1)  # [B, C]
         y = torch.addcmul(shift, x, scale)
-        if tape is not None:
-            tape.append((x, y, mean, rate, scale))
         # mish(y) = y (1 - 2 / (1 + (1 + exp y)^2)), also where exp y is infinite
-        grown = y.exp().add_(1.0)
-        return torch.addcdiv(y, y, torch.addcmul(self.one, grown, grown), value=-2).view(shape)
+        grown = (y if tape is None else y.clamp(max=30.0)).exp().add_(one)
+        denominator = torch.addcmul(one, grown, grown)
+        if tape is not None:
+            slope = _mish_slope(y, grown, denominator)
+            tape.append((x, slope, mean, rate, scale))
+        return torch.addcdiv(y, y, denominator, value=-2).view(shape)
 
     def gradient(self, grad: Tensor, tape: list[Any]) -> Tensor:
         """From the gradient of the output to that of the input."""
-        x, y, mean, rate, scale = tape.pop()
+        x, slope, mean, rate, scale = tape.pop()
         shape, grouped = grad.shape, _grouped(grad.shape)
-        grad = grad.view(x.shape) * mish_slope(y)
+        grad = grad.view(x.shape) * slope
         # through the normalisation: what moves mean or deviation of a group is taken out
-        count = len(x) * grouped[-1]
-        first = (grad.sum(0) * scale).view(grouped).sum(-1, keepdim=True) / count
-        second = ((grad * x).sum(0) * scale).view(grouped).sum(-1, keepdim=True) / count
+        share = _number(1 / (len(x) * grouped[-1]), x.dtype)
+        sums = torch.stack([grad.sum(0), (grad * x).sum(0)]).mul_(scale)
+        sums = sums.view(2, *grouped).sum(-1, keepdim=True)
+        first, second = (sums * share).unbind(0)
         along = (second - mean * first) * rate * rate  # [B, groups, 1]
         constant = (mean * along - first).expand(grouped).flatten(1)
         along = along.expand(grouped).flatten(1)
@@ -140,10 +151,17 @@ def _grouped(shape: torch.Size) -> tuple[int, int, int]:
 
 def mish_slope(y: Tensor) -> Tensor:
     """Derivative of mish."""
-    grown = y.clamp(max=30.0).exp_().add_(1.0)
-    denominator = (grown * grown).add_(1.0)
-    slope = (grown - 1.0).mul_(grown).mul_(y).mul_(2.0).div_(denominator).sub_(1.0)
-    return slope.mul_(2.0).div_(denominator).add_(1.0)
+    one = _number(1.0, y.dtype)
+    grown = y.clamp(max=30.0).exp_().add_(one)
+    return _mish_slope(y, grown, torch.addcmul(one, grown, grown))
+
+
+def _mish_slope(y: Tensor, grown: Tensor, denominator: Tensor) -> Tensor:
+    """The same with g = 1 + exp y and d = 1 + g^2 given: 1 + 2 (2 y g (g - 1) / d - 1) / d."""
+    one = _number(1.0, y.dtype)
+    product = torch.addcmul(grown, grown, grown, value=-1).mul_(y)
+    inner = torch.addcdiv(one, product, denominator, value=2)
+    return torch.addcdiv(one, inner, denominator, value=-2)
 
 
 class FrozenResidualBlock:
