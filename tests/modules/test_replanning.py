@@ -151,3 +151,13 @@ def test_all_actions_of_a_plan_on_demand():
     assert torch.equal(out["actions"][..., 0, :], out["action"])
     with pytest.raises(ValueError, match="expected one and two, in the order of the table"):
         build_policy({**ABOUT, "planner": {**PLANNER, "out_keys": ["plan", "action", "actions"]}})
+
+
+@planners
+@pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16], ids=str)
+def test_under_autocast_actions_are_float32_as_environments_take_them(planner, dtype):
+    policy = with_replanning(make_policy(planner), 3)
+    told = {"observation": torch.randn(2, 3), "is_init": torch.ones(2, 1, dtype=torch.bool)}
+    with torch.autocast("cpu", dtype):
+        out = policy(TensorDict(told, [2]))
+    assert out["action"].dtype == torch.float32

@@ -59,7 +59,8 @@ class PlanActions(TensorDictModuleBase):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes the actions into ``tensordict`` and returns it."""
         states = tensordict.get(self.in_keys[0])[..., : self.steps + 1, :]
-        actions = self.inverse_dynamics(states[..., :-1, :], states[..., 1:, :])
+        with torch.autocast(states.device.type, enabled=False):  # as the planner's own action
+            actions = self.inverse_dynamics(states[..., :-1, :], states[..., 1:, :])
         return tensordict.set(self.out_keys[0], actions)
 
 
