@@ -165,14 +165,20 @@ def reference_plan(folder: Path, told, candidates: int, steps: int) -> Callable[
     guides = imported(folder, "diffuser.sampling.guides")
     diffusion = imported(folder, "diffuser.models.diffusion").GaussianDiffusion(
         networks.TemporalUnet(32, STATE + ACTION, STATE, dim=32, dim_mults=(1, 2, 4, 8)),
-        *(32, STATE, ACTION, steps),
+        horizon=32,
+        observation_dim=STATE,
+        action_dim=ACTION,
+        n_timesteps=steps,
         predict_epsilon=False,
     )
     value = networks.ValueFunction(32, STATE + ACTION, STATE, dim=32, dim_mults=(1, 2, 4, 8))
     guided = partial(
         sampler.n_step_guided_p_sample,
         guide=guides.ValueGuide(value.to(DEVICE).eval()),
-        **{"scale": 0.1, "t_stopgrad": 2, "n_guide_steps": 2, "scale_grad_by_std": True},
+        scale=0.1,
+        t_stopgrad=2,
+        n_guide_steps=2,
+        scale_grad_by_std=True,
     )
     diffusion = diffusion.to(DEVICE).eval()
     pins = {0: told["observation"], int(told["target_step"]): told["target"]}
