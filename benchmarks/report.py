@@ -18,7 +18,6 @@ HEADINGS = {"batch": "environments", "p50_ms": "ms", "p95_ms": "p95", "plain_ms"
 HEADINGS |= {name: name.replace("_bytes", " MB") for name in MEMORY}
 HEADINGS |= {"plain_scan_ms": "plain scan", "windows": "batch"}
 HEADINGS |= {"recorded_ms": "recorded", "added_ms": "added"}
-HEADINGS |= {"reference_ms": "reference", "width": "width of the return model"}
 SCALES = {"10000": "10k", "100000": "100k", "1000000": "1M"}
 PARTS = ("TS", "SE", "PL", "ID", "total")
 COLOURS = ("#4c72b0", "#dd8452", "#55a868", "#c44e52")  # as torchrl_rad's other pictures
@@ -137,14 +136,12 @@ def searches(entries: Entries) -> list[str | None]:
 def plans(entries: Entries) -> list[str | None]:
     found = chosen(entries, "plan")
     scaling = chosen(entries, "plan_scaling")
-    unets, beside = chosen(entries, "diffuser_plan"), chosen(entries, "diffuser_reference")
+    unets = chosen(entries, "diffuser_plan")
     keys, figures = ("size", "process", "batch", "candidates"), ("ms", "plain_ms", "ratio")
-    against = ("ms", "reference_ms", "ratio")
     return [
         pivot("Plans; the plain ones are in float32", found, keys, "precision", figures),
         pivot("More and more plans at a time", scaling, keys[:1] + keys[2:], "precision", figures),
         pivot("Plans of D-RAD", unets, ("sampler", "steps", "candidates"), "size", figures),
-        pivot("D-RAD and Diffuser's own code", beside, ("width",), "size", against),
     ]
 
 

@@ -1,21 +1,13 @@
-"""One plan of D-RAD, against a plain one and against that of Diffuser's own code.
-
-The latter needs einops and a clone of github.com/jannerm/diffuser, which DIFFUSER_REPOSITORY names.
-"""
+"""One plan of D-RAD, against a plain one."""
 
 from __future__ import annotations
 
 import argparse
-import os
-import sys
 from collections.abc import Callable
 from functools import partial
-from importlib import import_module
 from importlib.metadata import version
 from itertools import pairwise
-from pathlib import Path
 from time import perf_counter
-from types import ModuleType, SimpleNamespace
 
 import numpy as np
 import pytest
@@ -31,7 +23,6 @@ VERSIONS = {name: version(name) for name in ("torch", "torchrl", "tensordict", "
 DEVICE = torch.device("cuda:0" if torch.cuda.is_available() else "cpu")
 STATE, ACTION = 11, 3  # hopper
 LENGTH, AHEAD = 200, 17  # of the one episode; steps to the target
-REPOSITORY = os.environ.get("DIFFUSER_REPOSITORY")
 SECONDS = 3.0  # for the calls of one case; 5 at least, 50 at most
 
 Noise = Callable[..., torch.Tensor]  # (shape, device=)
@@ -52,6 +43,10 @@ def stated(benchmark):
 
 @pytest.fixture(scope="module")
 def database() -> ExpertDatabase:
+    return make_database()
+
+
+def make_database() -> ExpertDatabase:
     """One random walk; a plan costs the same whatever else was recorded."""
     generator = torch.Generator().manual_seed(0)
     state = torch.randn(LENGTH + 1, STATE, generator=generator).cumsum(0).to(DEVICE)
@@ -144,48 +139,6 @@ def best_plan(planner, sample, states, mask) -> dict[str, torch.Tensor]:
     return {"plan": plans[best], "action": action}
 
 
-# Diffuser's own
-
-
-def imported(folder: Path, name: str) -> ModuleType:
-    """A module of Diffuser without what its packages import for training and simulators of 2022."""
-    for package in ("diffuser", "diffuser.sampling"):
-        bare = sys.modules.setdefault(package, ModuleType(package))
-        bare.__path__ = [str(folder / package.replace(".", "/"))]
-    silent = SimpleNamespace(update=lambda _: None, stamp=lambda: None)
-    tools = sys.modules.setdefault("diffuser.utils", ModuleType("diffuser.utils"))
-    sys.modules["diffuser"].utils, tools.Silent = tools, lambda: silent
-    return import_module(name)
-
-
-def reference_plan(folder: Path, told, candidates: int, steps: int) -> Callable[[], object]:
-    """A plan by its own guided sampler; its return model is 32 wide, with halvings for 32 steps."""
-    networks = imported(folder, "diffuser.models.temporal")
-    sampler = imported(folder, "diffuser.sampling.functions")
-    guides = imported(folder, "diffuser.sampling.guides")
-    diffusion = imported(folder, "diffuser.models.diffusion").GaussianDiffusion(
-        networks.TemporalUnet(32, STATE + ACTION, STATE, dim=32, dim_mults=(1, 2, 4, 8)),
-        horizon=32,
-        observation_dim=STATE,
-        action_dim=ACTION,
-        n_timesteps=steps,
-        predict_epsilon=False,
-    )
-    value = networks.ValueFunction(32, STATE + ACTION, STATE, dim=32, dim_mults=(1, 2, 4, 8))
-    guided = partial(
-        sampler.n_step_guided_p_sample,
-        guide=guides.ValueGuide(value.to(DEVICE).eval()),
-        scale=0.1,
-        t_stopgrad=2,
-        n_guide_steps=2,
-        scale_grad_by_std=True,
-    )
-    diffusion = diffusion.to(DEVICE).eval()
-    pins = {0: told["observation"], int(told["target_step"]): told["target"]}
-    pins = {place: state.repeat(candidates, 1) for place, state in pins.items()}
-    return lambda: diffusion.conditional_sample(pins, verbose=False, sample_fn=guided)
-
-
 # both in alternation
 
 
@@ -252,24 +205,6 @@ def test_rad_diffuser_plan_speed(benchmark, database, sampler, steps, candidates
         plain_ms = float(np.median(times[1:]))
         ratio = plain_ms / (1e3 * benchmark.stats["median"])
         benchmark.extra_info.update(plain_ms=plain_ms, ratio=ratio)
-
-
-@pytest.mark.skipif(REPOSITORY is None, reason="DIFFUSER_REPOSITORY names no clone of Diffuser")
-@pytest.mark.parametrize("width", [16, 32], ids="j{}".format)
-@torch.no_grad()
-def test_rad_diffuser_reference_speed(benchmark, database, width):
-    """64 candidates in 20 guided ancestral steps, and Diffuser's own beside them."""
-    planner = make_planner(
-        database, sampler="ancestral", steps=20, candidates=64, return_model={"width": width}
-    )
-    told = make_told(database)
-    reference = reference_plan(Path(REPOSITORY), told, candidates=64, steps=20)
-    times = []  # of the reference
-    run(benchmark, lambda: planner(told.copy()), lambda: times.append(spent(reference)))
-    if benchmark.enabled:
-        reference_ms = float(np.median(times[1:]))
-        ratio = reference_ms / (1e3 * benchmark.stats["median"])
-        benchmark.extra_info.update(size="hopper", reference_ms=reference_ms, ratio=ratio)
 
 
 if __name__ == "__main__":

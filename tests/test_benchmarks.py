@@ -13,7 +13,6 @@ ROOT = Path(__file__).parents[1]
 FILES = sorted((ROOT / "benchmarks").glob("test_*.py"))
 LARGER = "100k 1M 17d 29d 60d k500 q50 c4 c16 c64 b4 b16 b50 b64 b128 h129".split()
 LARGER += "bf16 fp16 hopper antmaze s20".split()
-OUTSIDE = {("test_rad_diffuser_benchmark", "test_rad_diffuser_reference_speed")}  # Diffuser's code
 
 
 def functions(tree):
@@ -27,14 +26,11 @@ def test_each_benchmark_runs_at_its_smallest_size():
     # -vv: pyproject.toml asks for -q, which takes one v away
     command += ["-p", "no:cacheprovider", "-k", f"not ({' or '.join(LARGER)})"]
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "RL_WARNINGS": "0", "COLUMNS": "200"}
-    environment.pop("DIFFUSER_REPOSITORY", None)
     done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True)
     assert done.returncode == 0, done.stdout[-5000:] + done.stderr[-2000:]
     ran = re.findall(r"(\w+)\.py::(\w+)(?:\[\S+\])? PASSED", done.stdout)
     expected = {(f.stem, name) for f in FILES for name in functions(ast.parse(f.read_text()))}
-    assert set(ran) == expected - OUTSIDE
-    skipped = re.findall(r"(\w+)\.py::(\w+)(?:\[\S+\])? SKIPPED", done.stdout)
-    assert set(skipped) == OUTSIDE
+    assert set(ran) == expected
 
 
 @pytest.mark.parametrize("file", FILES, ids=lambda file: file.stem)
