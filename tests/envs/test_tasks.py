@@ -158,6 +158,13 @@ def test_the_ant_starts_where_it_is_told():
         task.make_row(0, [(0, 0)])
 
 
+@pytest.mark.parametrize(("version", "width"), [("v4", 29), ("v5", 107)])
+def test_the_ant_is_as_wide_as_in_its_version(version, width):
+    task = AntMazeTask("ant", f"AntMaze_Medium-{version}", (6, 6))
+    assert task.widths() == (width, 8)
+    assert task.make_env(1, seed=0).rollout(2)["observation"].shape == (1, 2, width)
+
+
 def test_the_ant_is_paid_and_stops_at_the_goal():
     task = AntMazeTask("ant", "AntMaze_Medium-v4", (6, 6))
     env = task.make_row(0)

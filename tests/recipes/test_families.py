@@ -254,6 +254,15 @@ def test_data_of_another_environment(recipe, family, came, expected, folder):
     assert not (folder / "run" / "metrics.csv").exists()  # nothing was trained on it
 
 
+def test_an_environment_of_another_version_than_the_data(folder):
+    MAKERS["antmaze"](folder)
+    code, _, err = run("dl_rad.py", "antmaze", folder, "env.env_id=AntMaze_Medium-v5")
+    error = err.splitlines()[-1]
+    assert code == 1 and error.startswith("error: ") and "Traceback" not in err
+    assert "of widths (29, 8), but antmaze-medium-play has (107, 8)" in error
+    assert "the version of the data in env.env_id" in error
+
+
 def test_a_file_cut_short(folder):
     hopper(folder)
     path = folder / "hopper_medium_replay-v2.hdf5"

@@ -26,14 +26,14 @@ NOISE = 0.025  # of start and goal in cells of 4: D4RL's 0.1; gymnasium-robotics
 class AntMazeTask(Task):
     """gymnasium-robotics' AntMaze by D4RL's protocol: one goal cell, over when it is reached.
 
-    The state is x, y and the 27 entries of the ant's body. The score is the share of episodes that
-    reach the goal. Recorded steps are rewarded where the next state lies within 0.5 of the centre
-    of the goal cell, though the recording goes on there. ``starts`` of :meth:`make_env` are cells
-    (row, column), which rows take in turn.
+    The state is x, y and the 27 entries of the ant's body (105 in -v5). The score is the share of
+    episodes that reach the goal. Recorded steps are rewarded where the next state lies within 0.5
+    of the centre of the goal cell, though the recording goes on there. ``starts`` of
+    :meth:`make_env` are cells (row, column), which rows take in turn.
 
     Attributes:
         name: of the task.
-        env_id: gymnasium id, such as ``"AntMaze_Medium-v4"`` (-v5 has other observations).
+        env_id: gymnasium id, such as ``"AntMaze_Medium-v4"``, of the data's version.
         goal_cell, reset_cell: (row, column).
         max_steps: length of an episode.
 
@@ -74,7 +74,7 @@ class AntMazeTask(Task):
 
 
 class FixedGoalAntMaze(gym.Wrapper):
-    """AntMaze with a fixed goal cell and start cell, whose observation is the state [29].
+    """AntMaze with a fixed goal cell and start cell, whose observation is the state.
 
     Args:
         task (AntMazeTask): the protocol.
@@ -87,7 +87,7 @@ class FixedGoalAntMaze(gym.Wrapper):
     def __init__(self, task: AntMazeTask, reset_cell: tuple[int, int] | None = None):
         gym.register_envs(gymnasium_robotics)
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", DeprecationWarning)  # v5 has 105 entries, not 27
+            warnings.simplefilter("ignore", DeprecationWarning)  # v4 is what D4RL's data is of
             env = gym.make(task.env_id, continuing_task=False, max_episode_steps=task.max_steps)
         super().__init__(env)
         self.adapter = task.adapter
@@ -99,7 +99,8 @@ class FixedGoalAntMaze(gym.Wrapper):
             task.env_id, self.maze.maze_map, goal_cell=task.goal_cell, reset_cell=start
         )
         self.goal = self.maze.cell_rowcol_to_xy(self.goal_cell)
-        self.observation_space = gym.spaces.Box(-np.inf, np.inf, (29,), np.float32)
+        shape = self.adapter(env.observation_space.sample()).shape  # 107 entries in v5
+        self.observation_space = gym.spaces.Box(-np.inf, np.inf, shape, np.float32)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None):
         cells = {"goal_cell": self.goal_cell, "reset_cell": self.reset_cell}

@@ -67,7 +67,8 @@ class _Flat(gym.Wrapper):
     def __init__(self, env: gym.Env, task: KitchenTask):
         super().__init__(env)
         self.adapter = task.adapter
-        self.observation_space = gym.spaces.Box(-np.inf, np.inf, (59,), np.float32)
+        shape = self.adapter(env.observation_space.sample()).shape
+        self.observation_space = gym.spaces.Box(-np.inf, np.inf, shape, np.float32)
 
     def reset(self, **options):
         observation, _ = self.env.reset(**options)

@@ -101,7 +101,8 @@ def check_data(task: Task, data: TensorDictBase) -> DataReport:
     if came != expected:
         raise ValueError(
             f"the data has observations and actions of widths {came}, but {task.name} has "
-            f"{expected}: it is of another environment. Name another replay_buffer.dataset."
+            f"{expected}: it is of another environment, or of another version of it. Name another "
+            "replay_buffer.dataset, or the version of the data in env.env_id."
         )
     found = report(data, starts=task.starts())
     if not found.ok:
