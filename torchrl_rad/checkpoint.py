@@ -278,7 +278,12 @@ def load_weights(folder: str | Path, name: str, module: nn.Module) -> None:
     try:
         module.load_state_dict(load_tensors(Path(folder) / file))
     except RuntimeError as error:
-        raise CheckpointError(f"{Path(folder) / file} does not fit this module: {error}") from error
+        first, *others = [line.strip() for line in str(error).splitlines()[1:]] or [str(error)]
+        more = f" (and {len(others)} more)" if others else ""
+        raise CheckpointError(
+            f"{Path(folder) / file} does not fit this module, of another task or with other "
+            f"settings: {first}{more}"
+        ) from error
 
 
 def _checkpoints(folder: Path) -> list[tuple[int, Path]]:

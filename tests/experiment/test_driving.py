@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from torchrl_rad.envs import make_task
-from torchrl_rad.experiment import Driver
+from torchrl_rad.experiment import Driver, check_evaluation
 from torchrl_rad.policy import load_policy
 from torchrl_rad.runs import RunFolder
 
@@ -50,3 +50,21 @@ def test_same_evaluation_on_ray(ray, folder):
 
 def test_all_in_one_by_default(folder):
     assert (drive(folder) == drive(folder, collector={"rows": 3})).all()
+
+
+@pytest.mark.parametrize(
+    ("changes", "error", "message"),
+    [
+        ({"episodes": 0}, ValueError, "there are 0 episodes"),
+        ({"replan": 0}, ValueError, "interval is 0; expected 1 to 4"),
+        ({"replan": 5}, ValueError, "interval is 5; expected 1 to 4, the steps of the plan's fin"),
+        ({"starts": {"cells": [[1, 1], [0, 0]]}}, ValueError, "cell .0, 0. of .* is a wall"),
+        ({"starts": {"cells": []}}, ValueError, "expected cells or states"),
+        ({"starts": {"states": ["nowhere.hdf5"]}}, FileNotFoundError, "nowhere.hdf5"),
+    ],
+)
+def test_what_could_not_be_driven(folder, changes, error, message):
+    policy, settings = load_policy(folder), CONFIG["evaluation"]
+    check_evaluation({**settings, "replan": 4}, TASK, [policy])
+    with pytest.raises(error, match=message):
+        check_evaluation({**settings, **changes}, TASK, [policy])

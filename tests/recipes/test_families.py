@@ -263,6 +263,15 @@ def test_an_environment_of_another_version_than_the_data(folder):
     assert "the version of the data in env.env_id" in error
 
 
+@pytest.mark.parametrize("recipe", RECIPES)
+def test_an_evaluation_that_cannot_be_is_refused_before_the_training(recipe, folder):
+    MAKERS["hopper"](folder)
+    code, _, err = run(recipe, "hopper", folder, "evaluation.replan=200")
+    error = err.splitlines()[-1]
+    assert code == 1 and error.startswith("error: interval is 200; expected 1 to ")
+    assert not (folder / "run" / "metrics.csv").exists()
+
+
 def test_a_file_cut_short(folder):
     hopper(folder)
     path = folder / "hopper_medium_replay-v2.hdf5"

@@ -9,7 +9,7 @@ from torchrl_rad.experiment.data import (
     task_dataset,
     window_sampler,
 )
-from torchrl_rad.experiment.driving import Driver, collector_settings
+from torchrl_rad.experiment.driving import Driver, check_evaluation, collector_settings
 from torchrl_rad.experiment.episodes import (
     HeldRows,
     Unit,
@@ -60,6 +60,7 @@ __all__ = [
     "TaskRows",
     "Unit",
     "check_data",
+    "check_evaluation",
     "collect_episodes",
     "collector_settings",
     "denoising_objective",

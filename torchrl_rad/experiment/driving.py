@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from tensordict import TensorDictBase
@@ -16,7 +16,7 @@ from torchrl_rad.modules.replanning import with_replanning
 from torchrl_rad.precision import planning_dtype
 from torchrl_rad.runs import RunFolder
 
-__all__ = ["UNIT_ROWS", "Driver", "collector_settings"]
+__all__ = ["UNIT_ROWS", "Driver", "check_evaluation", "collector_settings"]
 
 UNIT_ROWS = 10  # of a unit on Ray: fewer plan slowly, more leave workers waiting at the end
 
@@ -51,6 +51,27 @@ def collector_settings(settings: Mapping[str, Any] | None) -> dict[str, Any]:
         if chosen[name] is not None and chosen[name] < 1:
             raise ValueError(f"collector.{name} is {chosen[name]}; expected at least 1.")
     return chosen
+
+
+def check_evaluation(
+    settings: Mapping[str, Any], task: Task, policies: Iterable[TensorDictSequential]
+) -> None:
+    """Refuses a config's ``evaluation`` that these policies or this task could not do.
+
+    A recipe asks before it trains.
+
+    Raises:
+        FileNotFoundError: the data set of the start states is not here.
+        ValueError: there is no episode, no such start, or a plan does not reach to the next one.
+    """
+    split_units(settings["episodes"], None, settings["seed"])
+    replan = settings.get("replan", 1)
+    for policy in policies:
+        if replan != 1:
+            with_replanning(policy, replan)
+    starts = load_starts(settings["starts"])
+    for number in range(task.variants(starts)):
+        task.make_row(number, starts).close()
 
 
 class Driver:

@@ -27,7 +27,7 @@ from torchrl_rad.experiment.data import (
     resolve_dataset,
     window_sampler,
 )
-from torchrl_rad.experiment.driving import collector_settings
+from torchrl_rad.experiment.driving import check_evaluation, collector_settings
 from torchrl_rad.experiment.policies import (
     BACKBONE,
     PolicyParts,
@@ -233,6 +233,7 @@ def _whole_run(
     _say(check_data(task, data))
     _say(describe_windows(data, cfg["network"]["horizon"]))
     policies = make_policies(cfg["network"], cfg["retrieval"], data)
+    check_evaluation(cfg["evaluation"], task, [parts.policy for parts in policies.values()])
     for parts in policies.values():
         parts.policy.to(cfg["device"])
     for name, parts in policies.items():
