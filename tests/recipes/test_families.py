@@ -263,6 +263,24 @@ def test_an_environment_of_another_version_than_the_data(folder):
     assert "the version of the data in env.env_id" in error
 
 
+@pytest.mark.parametrize(
+    ("setting", "message"),
+    [
+        ("+retrieval.followed.target.aheads=3", "unexpected keyword argument 'aheads'"),
+        ("retrieval.followed.expert={rule: first_hit_within, args: [1]}", "argument: 'high'"),
+        ("retrieval.followed.sampler.k=few", "a setting of the planner or of retrieval is wrong"),
+        ("replay_buffer.batch_size=0", "replay_buffer.batch_size is 0; expected 1 or more"),
+        ("threads=0", "threads is 0 and"),
+    ],
+)
+def test_a_wrong_setting_ends_in_one_line(setting, message, folder):
+    MAKERS["hopper"](folder)
+    code, _, err = run("dl_rad.py", "hopper", folder, setting)
+    error = err.splitlines()[-1]
+    assert code == 1 and error.startswith("error: ") and message in error
+    assert "Traceback" not in err
+
+
 @pytest.mark.parametrize("recipe", RECIPES)
 def test_an_evaluation_that_cannot_be_is_refused_before_the_training(recipe, folder):
     MAKERS["hopper"](folder)

@@ -227,6 +227,7 @@ def expert_from_config(config: dict[str, Any]) -> Expert:
 
     Raises:
         KeyError: the rule's name is not known.
+        TypeError: it takes other arguments.
 
     Examples:
         >>> expert_from_config({"rule": "first_hit_within", "args": [150, 600]})

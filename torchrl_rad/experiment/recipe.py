@@ -19,6 +19,7 @@ from torchrl.objectives.common import LossModule
 from torchrl.record.loggers import get_logger
 
 from torchrl_rad.checkpoint import Checkpointer, CheckpointError, state_digest
+from torchrl_rad.data.database import ExpertDatabase
 from torchrl_rad.envs.maze import MazeTask
 from torchrl_rad.experiment.data import (
     check_data,
@@ -219,31 +220,48 @@ def _new_folder(name: str) -> Path:
     raise AssertionError("numbers do not end")
 
 
+def _check_settings(cfg: Mapping[str, Any]) -> None:
+    """Refuses now what would fail after the data is made, or after the training."""
+    collector_settings(cfg.get("collector"))
+    if cfg["loss"]["value"] not in ("recorded", "iql"):
+        raise ValueError(f"loss.value is {cfg['loss']['value']!r}; expected 'recorded' or 'iql'.")
+    threads, batch = cfg["threads"], cfg["replay_buffer"]["batch_size"]
+    if min(threads, batch) < 1:
+        raise ValueError(
+            f"threads is {threads} and replay_buffer.batch_size is {batch}; expected 1 or more of "
+            "both."
+        )
+
+
+def _say_kept(name: str, database: ExpertDatabase, data: TensorDictBase) -> None:
+    """How many episodes the expert rule of a policy keeps."""
+    total, kept = (len(rows["episode"].unique()) for rows in (data, database[:]))
+    _say(f"{name}: {kept} of {total} episodes ({kept / total:.1%}), {len(database)} rows")
+    if kept == total and database.expert is not None:
+        advice = f"retrieval.{name}.expert='{{rule: top_share_by_return, args: [0.1]}}'"
+        _say(f"WARNING: {name}'s rule keeps every episode; choose by {advice}")
+
+
 def _whole_run(
     run: RunFolder, cfg: dict[str, Any], make_objectives: MakeObjectives, resume: bool
 ) -> None:
     """From the data to the table."""
-    collector_settings(cfg.get("collector"))  # refused now, not after the training
+    _check_settings(cfg)
     torch.set_num_threads(cfg["threads"])
     torch.manual_seed(cfg["seed"])  # fresh weights are the same when resumed
-    if cfg["loss"]["value"] not in ("recorded", "iql"):
-        raise ValueError(f"loss.value is {cfg['loss']['value']!r}; expected 'recorded' or 'iql'.")
     _say(f"run folder: {run.path}\ndata: {cfg['replay_buffer']['dataset']}")
     task, data = first_before_others(lambda: make_data(cfg))  # which may record it
     _say(check_data(task, data))
     _say(describe_windows(data, cfg["network"]["horizon"]))
-    policies = make_policies(cfg["network"], cfg["retrieval"], data)
+    try:
+        policies = make_policies(cfg["network"], cfg["retrieval"], data)
+    except TypeError as error:  # names and types of settings are those of the modules' arguments
+        raise ValueError(f"a setting of the planner or of retrieval is wrong: {error}") from error
     check_evaluation(cfg["evaluation"], task, [parts.policy for parts in policies.values()])
-    for parts in policies.values():
-        parts.policy.to(cfg["device"])
     for name, parts in policies.items():
+        parts.policy.to(cfg["device"])
         if parts.database is not None:
-            total, kept = (len(t["episode"].unique()) for t in (data, parts.database[:]))
-            share = f"{kept} of {total} episodes ({kept / total:.1%})"
-            _say(f"{name}: {share}, {len(parts.database)} rows")
-            if kept == total and parts.database.expert is not None:
-                advice = f"retrieval.{name}.expert='{{rule: top_share_by_return, args: [0.1]}}'"
-                _say(f"WARNING: {name}'s rule keeps every episode; choose by {advice}")
+            _say_kept(name, parts.database, data)
     data = data.to(cfg["device"]) if cfg["device"] != "cpu" else data
     trained = not cfg.get("weights")
     if trained:
