@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 
 __all__ = ["ObservationAdapter"]
@@ -45,6 +46,16 @@ class ObservationAdapter:
             )
         parts = [np.asarray(observation[key], dtype=np.float32) for key in self.keys]
         return np.concatenate(parts, axis=-1)
+
+    def space(self, space: gym.Space) -> gym.spaces.Box:
+        """Of the vectors that it makes of the observations of a space.
+
+        Examples:
+            >>> import gymnasium as gym
+            >>> ObservationAdapter().space(gym.spaces.Box(-1.0, 1.0, (3,))).shape
+            (3,)
+        """
+        return gym.spaces.Box(-np.inf, np.inf, self(space.sample()).shape, np.float32)
 
     def __repr__(self) -> str:
         return f"ObservationAdapter({self.keys})"

@@ -9,7 +9,6 @@ from typing import Any
 
 import gymnasium as gym
 import gymnasium_robotics
-import numpy as np
 from tensordict import TensorDictBase
 from torch import Tensor
 
@@ -99,8 +98,7 @@ class FixedGoalAntMaze(gym.Wrapper):
             task.env_id, self.maze.maze_map, goal_cell=task.goal_cell, reset_cell=start
         )
         self.goal = self.maze.cell_rowcol_to_xy(self.goal_cell)
-        shape = self.adapter(env.observation_space.sample()).shape  # 107 entries in v5
-        self.observation_space = gym.spaces.Box(-np.inf, np.inf, shape, np.float32)
+        self.observation_space = self.adapter.space(env.observation_space)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None):
         cells = {"goal_cell": self.goal_cell, "reset_cell": self.reset_cell}

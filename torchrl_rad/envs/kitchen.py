@@ -7,7 +7,6 @@ from typing import Any
 
 import gymnasium as gym
 import gymnasium_robotics
-import numpy as np
 from tensordict import TensorDictBase
 
 from torchrl_rad.data.kitchen import relabel_tasks
@@ -67,8 +66,7 @@ class _Flat(gym.Wrapper):
     def __init__(self, env: gym.Env, task: KitchenTask):
         super().__init__(env)
         self.adapter = task.adapter
-        shape = self.adapter(env.observation_space.sample()).shape
-        self.observation_space = gym.spaces.Box(-np.inf, np.inf, shape, np.float32)
+        self.observation_space = self.adapter.space(env.observation_space)
 
     def reset(self, **options):
         observation, _ = self.env.reset(**options)

@@ -136,7 +136,7 @@ class FixedGoalMaze(gym.Wrapper):
             self.reset_cells = np.stack(given)
         self.goal = self.maze.cell_rowcol_to_xy(self.goal_cell)
         self.show_goal = show_goal
-        state = gym.spaces.Box(-np.inf, np.inf, (4,), np.float32)
+        state = self.adapter.space(self.env.observation_space)
         goal = gym.spaces.Box(-np.inf, np.inf, (2,), np.float32)
         both = gym.spaces.Dict({"observation": state, "goal": goal})
         self.observation_space = both if show_goal else state

@@ -8,6 +8,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
+from torchrl_rad.envs.adapter import ObservationAdapter
 from torchrl_rad.envs.task import Task
 
 __all__ = ["OGBenchTask"]
@@ -70,7 +71,7 @@ class _WithGoal(gym.Wrapper):
             np.zeros(2, np.float32),
             np.random.default_rng(),
         )
-        state = gym.spaces.Box(-np.inf, np.inf, (29,), np.float32)
+        state = ObservationAdapter().space(env.observation_space)
         goal = gym.spaces.Box(-np.inf, np.inf, (2,), np.float32)
         self.observation_space = gym.spaces.Dict({"observation": state, "goal": goal})
 

@@ -66,12 +66,13 @@ def check_evaluation(
     """
     split_units(settings["episodes"], None, settings["seed"])
     replan = settings.get("replan", 1)
-    for policy in policies:
-        if replan != 1:
+    if replan != 1:
+        for policy in policies:
             with_replanning(policy, replan)
-    starts = load_starts(settings["starts"])
-    for number in range(task.variants(starts)):
-        task.make_row(number, starts).close()
+    if settings["starts"] is not None:
+        starts = load_starts(settings["starts"])
+        for number in range(task.variants(starts)):
+            task.make_row(number, starts).close()
 
 
 class Driver:
