@@ -1,8 +1,9 @@
 """One plan of D-RAD beside one by Diffuser's own code, in alternation; times are medians in ms.
 
-    python benchmarks/beside_diffuser.py <clone of github.com/jannerm/diffuser>
+    python benchmarks/beside_diffuser.py <clone of github.com/jannerm/diffuser> [--compile]
 
-It needs einops.
+It needs einops. Diffuser's code runs as it is; with --compile this planner's networks are compiled
+beforehand (DiffuserPlanner.compile), which takes minutes.
 """
 
 from __future__ import annotations
@@ -68,12 +69,13 @@ def reference_plan(folder: Path, ours: ModuleType, told) -> Callable[[], object]
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("clone", type=Path)
-    folder = parser.parse_args().clone
+    parser.add_argument("--compile", action="store_true")
+    args = parser.parse_args()
     ours = import_module("test_rad_diffuser_benchmark")  # of this folder
     torch.set_num_threads(ours.THREADS)
     database = ours.make_database()
     told = ours.make_told(database)
-    reference = reference_plan(folder, ours, told)
+    reference = reference_plan(args.clone, ours, told)
     print("| width of the return model | ms | reference | ratio |\n|---|---|---|---|")
     for width in (16, 32):
         planner = ours.make_planner(
@@ -83,6 +85,8 @@ def main() -> None:
             candidates=CANDIDATES,
             return_model={"width": width},
         )
+        if args.compile:
+            planner.compile()
         pairs = [(ours.spent(partial(planner, told)), ours.spent(reference)) for _ in range(ROUNDS)]
         mine, theirs = (median(times[1:]) for times in zip(*pairs, strict=True))
         print(f"| {width} | {mine:.0f} | {theirs:.0f} | {theirs / mine:.2f} |")

@@ -291,6 +291,62 @@ def test_frozen_networks_plan_as_the_networks_do(horizon, dtype):
     torch.testing.assert_close(frozen["action"], plain["action"], atol=1e-3, rtol=1e-3)
 
 
+# compiled networks
+
+
+class Graphs:
+    """A backend that runs what it is given, and counts."""
+
+    def __init__(self):
+        self.count = 0
+
+    def __call__(self, graph, inputs):
+        self.count += 1
+        return graph.forward
+
+
+@pytest.fixture
+def graphs():
+    torch._dynamo.reset()
+    yield Graphs()
+    torch._dynamo.reset()
+
+
+def test_compiled_networks_plan_as_they_do(graphs):
+    options = {"guided": True, "multiples": (1,), "noise": "seeded", "guide_scale": 5.0, "steps": 5}
+    planner, compiled = make(**options), make(**options)
+    compiled.load_state_dict(planner.state_dict())
+    compiled.compile(backend=graphs, fullgraph=True)
+    # one graph for all steps of the U-Net, and one of the gradient
+    for rows, made in [(6, 2), (6, 2), (5, 4), (6, 4)]:
+        td = batch(rows)
+        torch.testing.assert_close(compiled(td.copy())["plan"], planner(td)["plan"])
+        assert graphs.count == made
+
+
+def test_compiled_networks_follow_the_weights(graphs):
+    planner, td = make(multiples=(1,), noise="seeded"), batch(3)
+    planner.compile(backend=graphs)
+    before = planner(td.copy())["plan"]
+    made = graphs.count
+    with torch.no_grad():
+        planner.networks[0].head.bias += 1.0
+    assert not torch.allclose(planner(td.copy())["plan"], before)
+    assert graphs.count == made
+    copied = copy.deepcopy(planner)
+    assert torch.equal(copied(td.copy())["plan"], planner(td)["plan"])
+    assert graphs.count == made
+
+
+def test_only_frozen_networks_are_compiled():
+    with pytest.raises(RuntimeError, match=r"horizon \(12\) is a multiple of 4 \* 2 \*\*"):
+        make(horizon=12).compile()
+    planner = make()
+    planner.networks[0].register_forward_hook(lambda module, args, out: None)
+    with pytest.raises(RuntimeError, match="without hooks"):
+        planner.compile()
+
+
 # keys
 
 

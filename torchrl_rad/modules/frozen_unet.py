@@ -7,7 +7,7 @@ step 4 t + p of a sequence is at [p, t], so that the four outputs are whole bloc
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import lru_cache
 from typing import Any, cast
 
@@ -26,12 +26,20 @@ from torchrl_rad.modules.temporal_unet import (
 
 __all__ = ["FrozenReturnModel", "FrozenUNet", "can_tile"]
 
+Function = Callable[[Tensor, Tensor, Tensor], Tensor]
+
 EPSILON = 1e-5  # of GroupNorm
 
 
-@lru_cache
 def _number(value: float, dtype: torch.dtype) -> Tensor:
     """A 0-dim tensor: torch makes one of a Python number at each call, which takes microseconds."""
+    if torch.compiler.is_compiling():  # where they are constants, and caches are warned of
+        return torch.tensor(value, dtype=dtype)
+    return _kept_number(value, dtype)
+
+
+@lru_cache
+def _kept_number(value: float, dtype: torch.dtype) -> Tensor:
     return torch.tensor(value, dtype=dtype)
 
 
@@ -171,14 +179,14 @@ class FrozenResidualBlock:
         self.first, self.second = (
             FrozenConvBlock(part, gradients) for part in (block.first, block.second)
         )
-        self.time = block.time(codes).unbind(0)
+        self.time = block.time(codes)  # [K, C]
         self.skip: tuple[Tensor, Tensor] | None = None
         if isinstance(block.skip, nn.Conv1d):
             weight = block.skip.weight.detach()[..., 0].T.contiguous()
             self.skip = weight, cast(Tensor, block.skip.bias).detach()
 
-    def __call__(self, x: Tensor, step: int, tape: list[Any] | None = None) -> Tensor:
-        h = self.second(self.first(x, tape).add_(self.time[step]), tape)
+    def __call__(self, x: Tensor, step: Tensor, tape: list[Any] | None = None) -> Tensor:
+        h = self.second(self.first(x, tape).add_(self.time.index_select(0, step)), tape)
         if self.skip is None:
             return h.add_(x)
         weight, bias = self.skip
@@ -260,7 +268,7 @@ class FrozenEncoder:
         )
         self.down = [FrozenDown(cast(nn.Conv1d, conv)) for conv in encoder.down]
 
-    def __call__(self, x: Tensor, step: int, tape: list[Any] | None = None) -> list[Tensor]:
+    def __call__(self, x: Tensor, step: Tensor, tape: list[Any] | None = None) -> list[Tensor]:
         seen: list[Tensor] = []
         for level, (first, second) in enumerate(zip(self.first, self.second, strict=True)):
             x = x if level == 0 else self.down[level - 1](x)
@@ -278,6 +286,11 @@ class FrozenEncoder:
 def _codes(code: TimeCode, times: Sequence[float]) -> Tensor:
     """Time codes [K, W]."""
     return code(torch.tensor(times, device=code.first.weight.device))
+
+
+def _numbers(codes: Tensor) -> tuple[Tensor, ...]:
+    """Those of the times as tensors [1]: of Python's a compiled function would be made for each."""
+    return torch.arange(len(codes)).split(1)
 
 
 def _input(x: Tensor, prepared: Tensor) -> Tensor:
@@ -314,6 +327,11 @@ class FrozenUNet:
         self.last, self.dtype = FrozenConvBlock(network.last, False), codes.dtype
         self.weight = network.head.weight.detach()[..., 0].T.contiguous()
         self.bias = cast(Tensor, network.head.bias).detach()
+        self.numbers, self.compiled = _numbers(codes), cast(Function | None, None)
+
+    def compile(self, options: Mapping[str, Any]) -> None:
+        """Predictions are compiled with these options of :func:`torch.compile`."""
+        self.compiled = torch.compile(self._predict, **options)
 
     def prepare(self, mask: Tensor) -> Tensor:
         """The mask's channel, steps first."""
@@ -321,6 +339,9 @@ class FrozenUNet:
 
     def __call__(self, x: Tensor, prepared: Tensor, step: int, free: slice) -> Tensor:
         """As :meth:`~torchrl_rad.modules.frozen.StepNetwork.__call__`."""
+        return (self.compiled or self._predict)(x, prepared, self.numbers[step])[:, free]
+
+    def _predict(self, x: Tensor, prepared: Tensor, step: Tensor) -> Tensor:
         seen = self.encoder(_input(x, prepared), step)
         h = seen[-1]
         for block in self.middle:
@@ -329,7 +350,7 @@ class FrozenUNet:
             h = up(second(first(torch.cat([h, seen.pop()], -1), step), step))
         h = as_steps(self.last(h))
         y = torch.addmm(self.bias, h.flatten(0, 1), self.weight)
-        return y.view(*h.shape[:2], len(self.bias)).transpose(0, 1)[:, free]
+        return y.view(*h.shape[:2], len(self.bias)).transpose(0, 1)
 
 
 class FrozenReturnModel:
@@ -361,11 +382,16 @@ class FrozenReturnModel:
         self.mix = mix.reshape(flat, -1)
         head = cast(nn.Linear, model.head[1])
         self.weight, self.bias = head.weight.detach()[0], head.bias.detach()
+        self.numbers, self.compiled = _numbers(codes), cast(Function | None, None)
 
-    def _mixed(self, x: Tensor, mask: Tensor, step: int, tape: list[Any] | None) -> Tensor:
+    def compile(self, options: Mapping[str, Any]) -> None:
+        """Gradients are compiled with these options of :func:`torch.compile`."""
+        self.compiled = torch.compile(self._slope, **options)
+
+    def _mixed(self, x: Tensor, mask: Tensor, step: Tensor, tape: list[Any] | None) -> Tensor:
         prepared = mask.transpose(0, 1).to(x.dtype)
         low = self.encoder(_input(x, prepared), step, tape)[-1]
-        return torch.addmm(self.time[step], self._flat(low), self.mix)
+        return torch.addmm(self.time.index_select(0, step), self._flat(low), self.mix)
 
     def _flat(self, low: Tensor) -> Tensor:
         """[4, T, B, C] to [B, L * C]."""
@@ -374,11 +400,15 @@ class FrozenReturnModel:
     @torch.no_grad()
     def value(self, x: Tensor, mask: Tensor, step: int) -> Tensor:
         """Predicted return [B] of [B, H, D] in units of the deviation."""
-        return nn.functional.mish(self._mixed(x, mask, step, None)) @ self.weight + self.bias
+        mixed = self._mixed(x, mask, self.numbers[step], None)
+        return nn.functional.mish(mixed) @ self.weight + self.bias
 
     @torch.no_grad()
     def gradient(self, x: Tensor, mask: Tensor, step: int) -> Tensor:
         """Of that return with respect to ``x``."""
+        return (self.compiled or self._slope)(x, mask, self.numbers[step])
+
+    def _slope(self, x: Tensor, mask: Tensor, step: Tensor) -> Tensor:
         tape: list[Any] = []
         mixed = self._mixed(x, mask, step, tape)
         grad = (mish_slope(mixed) * self.weight) @ self.mix.T  # [B, L * C]
