@@ -167,7 +167,7 @@ class DiffuserPlanner(Planner):
 
         It takes minutes for each number of rows, and needs a C++ compiler; plans are then 1.3 (64
         candidates) to 2.3 times (one) as fast. New weights are not compiled anew. The loop around
-        the networks stays as it is. On a GPU :meth:`capture` does more.
+        the networks stays as it is. For a GPU there is :meth:`capture`.
 
         Args:
             **options: of :func:`torch.compile`; ``dynamic`` is False if it is not given, since
@@ -190,8 +190,8 @@ class DiffuserPlanner(Planner):
         if not self._freezes(self.networks[0], TemporalUNet):
             raise RuntimeError(
                 "only frozen networks are compiled: those of a planner on the CPU, without hooks, "
-                f"whose horizon ({self.horizon}) is a multiple of 4 * 2 ** (resolutions - 1). On a "
-                "GPU call capture() instead."
+                f"whose horizon ({self.horizon}) is a multiple of 4 * 2 ** (resolutions - 1). For "
+                "a GPU there is capture()."
             )
         self._compiled = {"dynamic": False, **options}
         self._frozen, self._frozen_returns = FrozenCache(), FrozenCache()
