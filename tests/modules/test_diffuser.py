@@ -23,7 +23,7 @@ def make(seed=0, horizon=HORIZON, guided=False, **kwargs):
     states = Normalizer(torch.tensor([1.0, -3.0, 0.1]), torch.tensor([2.0, 0.3, 7.0]))
     options = {"width": 8, "multiples": (1, 2), "steps": 3, **kwargs}
     if guided or options.get("candidates", 1) > 1:
-        model = NoisyReturnModel(states, ACTIONS, horizon, 8, (1, 2))
+        model = NoisyReturnModel(states, ACTIONS, horizon, 8, options["multiples"])
         options = {"return_model": model, "guide_stop": 1, **options}
     return DiffuserPlanner(states, ACTIONS, horizon, **options)
 
