@@ -327,7 +327,8 @@ class FrozenUNet:
         self.last, self.dtype = FrozenConvBlock(network.last, False), codes.dtype
         self.weight = network.head.weight.detach()[..., 0].T.contiguous()
         self.bias = cast(Tensor, network.head.bias).detach()
-        self.numbers, self.compiled = _numbers(codes), cast(Function | None, None)
+        self.numbers = _numbers(codes)
+        self.compiled: Function | None = None
 
     def compile(self, options: Mapping[str, Any]) -> None:
         """Predictions are compiled with these options of :func:`torch.compile`."""
@@ -382,7 +383,8 @@ class FrozenReturnModel:
         self.mix = mix.reshape(flat, -1)
         head = cast(nn.Linear, model.head[1])
         self.weight, self.bias = head.weight.detach()[0], head.bias.detach()
-        self.numbers, self.compiled = _numbers(codes), cast(Function | None, None)
+        self.numbers = _numbers(codes)
+        self.compiled: Function | None = None
 
     def compile(self, options: Mapping[str, Any]) -> None:
         """Gradients are compiled with these options of :func:`torch.compile`."""
